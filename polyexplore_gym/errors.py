@@ -1,0 +1,25 @@
+"""The exceptions a user may meet; all derive from `PolyExploreError`."""
+
+
+class PolyExploreError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class InvalidFloorPlanError(PolyExploreError, ValueError):
+    """A floor plan is unusable; the message names the ring, the vertex and the reason."""
+
+
+class InvalidConfigError(PolyExploreError, ValueError):
+    """A configuration field is unknown or out of range; the message names it."""
+
+
+class InvalidLogError(PolyExploreError, ValueError):
+    """A laser log cannot be read; the message names the file and the reason."""
+
+
+class ResultsError(PolyExploreError):
+    """Results on disk cannot be read, or do not belong to this run."""
+
+
+class MissingDependencyError(PolyExploreError, ImportError):
+    """An optional package is needed; the message says how to install it."""
