@@ -13,6 +13,10 @@ class InvalidConfigError(PolyExploreError, ValueError):
     """A configuration field is unknown or out of range; the message names it."""
 
 
+class InvalidMotionError(PolyExploreError, ValueError):
+    """A pose, path or wall array handed to the simulated world is unusable; the message says which and why."""
+
+
 class InvalidLogError(PolyExploreError, ValueError):
     """A laser log cannot be read; the message names the file and the reason."""
 
@@ -23,3 +27,7 @@ class ResultsError(PolyExploreError):
 
 class MissingDependencyError(PolyExploreError, ImportError):
     """An optional package is needed; the message says how to install it."""
+
+
+class RenderingError(PolyExploreError, ValueError):
+    """A picture or animation cannot be made; the message says why."""
