@@ -185,8 +185,8 @@ def _check_crossings(rings: list[np.ndarray], indices: list[np.ndarray], names: 
             reason = f"the edge after it {verb} the edge after vertex {index[b]}: the ring {verb} itself"
             fail(names[owner[a]], int(index[a]), reason)
         for a, b in zip(i, j, strict=True):
-            if verb := _relation(edges[a], edges[b]):
-                reason = f"the edge after it {verb} the edge of {names[owner[a]]} after its vertex {index[a]}"
+            if how := _relation(edges[a], edges[b]):
+                reason = f"the edge after it {how} the edge of {names[owner[a]]} after its vertex {index[a]}"
                 fail(names[owner[b]], int(index[b]), reason)
 
 
