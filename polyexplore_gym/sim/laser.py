@@ -36,7 +36,9 @@ def _bearing(y, x):  # type: ignore[no-untyped-def]
         return 0.0
     z = low / high
     w = z * z
-    angle = z * (0.99997726 + w * (-0.33262347 + w * (0.19354346 + w * (-0.11643287 + w * (0.05265332 - w * 0.01172120)))))
+    angle = z * (
+        0.99997726 + w * (-0.33262347 + w * (0.19354346 + w * (-0.11643287 + w * (0.05265332 - w * 0.01172120))))
+    )
     if ay > ax:
         angle = 0.5 * math.pi - angle
     if x < 0.0:

@@ -1,0 +1,215 @@
+"""The explored share of the free area, by sample points.
+
+A point counts as seen when it lies within the sensor's range and field of view and no wall crosses
+the sight line: geometric visibility from the true pose, not "some beam passed by", so that it does
+not depend on the number of beams or on the noise. It is exact up to rounding: each near, unseen
+point is itself a ray of the laser's kernel. A sight line that touches the very end of a wall is
+blocked (within `END_TOLERANCE`); a point on a wall is visible from the side that faces the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.config import SensorConfig
+from polyexplore_gym.errors import InvalidMotionError
+from polyexplore_gym.sim.laser import ON_LINE, out_of_reach, strike
+
+_CELL = 1.0
+_BINS = 1024
+_RANGE_TOLERANCE = 1e-9
+_DEPTH_TOLERANCE = 1e-9
+"""A wall hides a point only if it is nearer by this share of the distance."""
+
+
+@njit(cache=True, inline="always")
+def _pseudo_angle(y, x):  # type: ignore[no-untyped-def]
+    """Grows with the bearing from 0 to 4 over a turn, without trigonometry."""
+    p = y / (abs(x) + abs(y))
+    if x < 0.0:
+        return 2.0 - p
+    return p if y >= 0.0 else 4.0 + p
+
+
+@njit(cache=True)
+def _visible(segments, x, y, dx, dy):  # type: ignore[no-untyped-def]
+    """Which of the points at (dx, dy) (n,) from the sensor at x, y no wall hides: (n,) bool."""
+    n = dx.size
+    order, starts, bins = np.empty(n, np.int64), np.zeros(_BINS + 1, np.int64), np.empty(n, np.int64)
+    reach = 0.0
+    for i in range(n):
+        reach = max(reach, abs(dx[i]), abs(dy[i]))
+        at = _pseudo_angle(dy[i], dx[i]) if dx[i] != 0.0 or dy[i] != 0.0 else 0.0
+        bins[i] = min(int(at * (_BINS / 4.0)), _BINS - 1)
+        starts[bins[i] + 1] += 1
+    for k in range(_BINS):
+        starts[k + 1] += starts[k]
+    filled = starts[:_BINS].copy()
+    sx, sy, nearest = np.empty(n), np.empty(n), np.zeros(n)
+    for i in range(n):
+        j = filled[bins[i]]
+        filled[bins[i]] += 1
+        order[j] = i
+        sx[j], sy[j] = dx[i], dy[i]
+    for k in range(segments.shape[0]):
+        ax, ay = segments[k, 0] - x, segments[k, 1] - y
+        bx, by = segments[k, 2] - x, segments[k, 3] - y
+        if out_of_reach(ax, ay, bx, by, reach):
+            continue
+        cross = ax * by - ay * bx
+        length2 = (bx - ax) ** 2 + (by - ay) ** 2
+        if cross * cross <= ON_LINE * ON_LINE * length2:
+            _hide_edge_on(sx, sy, nearest, ax, ay, bx, by)
+            continue
+        if cross < 0.0:
+            ax, ay, bx, by = bx, by, ax, ay
+        low = min(int(_pseudo_angle(ay, ax) * (_BINS / 4.0)), _BINS - 1)
+        high = min(int(_pseudo_angle(by, bx) * (_BINS / 4.0)), _BINS - 1)
+        i, j = starts[low], starts[high + 1]
+        if low <= high:
+            strike(sx[i:j], sy[i:j], nearest[i:j], ax, ay, bx, by)
+        else:  # across the seam
+            strike(sx[i:], sy[i:], nearest[i:], ax, ay, bx, by)
+            strike(sx[:j], sy[:j], nearest[:j], ax, ay, bx, by)
+    out = np.empty(n, np.bool_)
+    for j in range(n):
+        out[order[j]] = nearest[j] <= 1.0 + _DEPTH_TOLERANCE
+    return out
+
+
+@njit(cache=True)
+def _hide_edge_on(sx, sy, nearest, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+    """A wall seen edge-on hides what lies exactly behind its nearer end; a sensor on the wall sees nothing."""
+    if ax * bx + ay * by <= 0.0:
+        nearest[:] = np.inf
+        return
+    if bx * bx + by * by < ax * ax + ay * ay:
+        ax, ay = bx, by
+    length2 = ax * ax + ay * ay
+    if length2 <= ON_LINE * ON_LINE:
+        nearest[:] = np.inf
+        return
+    for i in range(sx.size):
+        along = ax * sx[i] + ay * sy[i]
+        if along > 0.0 and abs(ax * sy[i] - ay * sx[i]) <= ON_LINE * math.hypot(sx[i], sy[i]):
+            nearest[i] = max(nearest[i], along / length2)
+
+
+@njit(cache=True)
+def _bucket(x, y, x0, y0, columns, rows):  # type: ignore[no-untyped-def]
+    """Points by grid cell: order (n,) and the start of each cell in it (cells + 1,)."""
+    n = x.size
+    cell, starts = np.empty(n, np.int64), np.zeros(columns * rows + 1, np.int64)
+    for i in range(n):
+        cell[i] = int((y[i] - y0) / _CELL) * columns + int((x[i] - x0) / _CELL)
+        starts[cell[i] + 1] += 1
+    for k in range(columns * rows):
+        starts[k + 1] += starts[k]
+    filled, order = starts[:-1].copy(), np.empty(n, np.int64)
+    for i in range(n):
+        order[filled[cell[i]]] = i
+        filled[cell[i]] += 1
+    return order, starts
+
+
+@njit(cache=True)
+def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, columns, x0, y0, seen):  # type: ignore[no-untyped-def]
+    """Mark the points seen from pose; the unseen ones of a cell stand first in it. Returns how many are new."""
+    rows = unseen.size // columns
+    x, y = pose[0], pose[1]
+    hx, hy, least = math.cos(pose[2]), math.sin(pose[2]), math.cos(half_view) - 1e-12
+    reach = max_range + _RANGE_TOLERANCE
+    c0, c1 = max(0, math.floor((x - reach - x0) / _CELL)), min(columns - 1, math.floor((x + reach - x0) / _CELL))
+    r0, r1 = max(0, math.floor((y - reach - y0) / _CELL)), min(rows - 1, math.floor((y + reach - y0) / _CELL))
+    count = 0
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            count += unseen[r * columns + c]
+    slots, dx, dy = np.empty(count, np.int64), np.empty(count), np.empty(count)
+    n = 0
+    for r in range(r0, r1 + 1):
+        for c in range(c0, c1 + 1):
+            cell = r * columns + c
+            for j in range(starts[cell], starts[cell] + unseen[cell]):
+                ux, uy = px[j] - x, py[j] - y
+                d2 = ux * ux + uy * uy
+                if d2 <= reach * reach and ux * hx + uy * hy >= least * math.sqrt(d2):
+                    slots[n], dx[n], dy[n] = j, ux, uy
+                    n += 1
+    visible = _visible(segments, x, y, dx[:n], dy[:n])
+    new = 0
+    for i in range(n - 1, -1, -1):  # from the back, so that a swap moves no slot still to come
+        if not visible[i]:
+            continue
+        j = slots[i]
+        cell = int((py[j] - y0) / _CELL) * columns + int((px[j] - x0) / _CELL)
+        last = starts[cell] + unseen[cell] - 1
+        unseen[cell] -= 1
+        seen[order[j]] = True
+        px[j], px[last] = px[last], px[j]
+        py[j], py[last] = py[last], py[j]
+        order[j], order[last] = order[last], order[j]
+        new += 1
+    return new
+
+
+class Coverage:
+    """Which sample points of the free area have been seen from the poses added so far."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        """points (k, 2) m, say a 0.2 m grid over the free area.
+
+        Raises `InvalidMotionError` unless they are finite, of that shape, and at least one.
+        """
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
+            raise InvalidMotionError(f"sample points of shape {points.shape}: expected finite (k, 2), k >= 1")
+        self._origin = points.min(axis=0)
+        extent = points.max(axis=0) - self._origin
+        self._columns = int(extent[0] / _CELL) + 1
+        rows = int(extent[1] / _CELL) + 1
+        if self._columns * rows > 50_000_000:
+            raise InvalidMotionError(f"sample points spread over {extent[0]:.3g} x {extent[1]:.3g} m: too far apart")
+        x0, y0 = self._origin
+        self._order, self._starts = _bucket(points[:, 0], points[:, 1], x0, y0, self._columns, rows)
+        self._x, self._y = points[self._order, 0].copy(), points[self._order, 1].copy()
+        self._unseen = np.diff(self._starts)
+        self._seen = np.zeros(len(points), dtype=np.bool_)
+        self._count = 0
+
+    @property
+    def share(self) -> float:
+        """Share of the points seen so far, 0 to 1."""
+        return self._count / len(self._seen)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(k,) bool, in the order of the points given; a copy."""
+        return self._seen.copy()
+
+    def add(self, segments: np.ndarray, pose: np.ndarray, sensor: SensorConfig) -> int:
+        """Mark the points seen from the true pose (3,) among walls (M, 4); returns how many are new."""
+        pose = np.ascontiguousarray(pose, dtype=np.float64)
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise InvalidMotionError(f"sensor pose {pose!r}: expected three finite numbers")
+        half_view = math.pi if sensor.full_circle else sensor.field_of_view / 2
+        new: int = _mark(
+            segments,
+            pose,
+            sensor.max_range,
+            half_view,
+            self._x,
+            self._y,
+            self._order,
+            self._starts,
+            self._unseen,
+            self._columns,
+            self._origin[0],
+            self._origin[1],
+            self._seen,
+        )
+        self._count += new
+        return new

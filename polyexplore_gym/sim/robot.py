@@ -1,0 +1,183 @@
+"""The robot's disc body among walls, and its motion along a path without dynamics.
+
+Kernels on arrays: walls (M, 4), points in metres. The distance from a moving point to a wall
+segment is convex in time, so a disc that starts clear of a wall meets it at most once, and one that
+touches it and moves away never meets it again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+STANDOFF = 1e-3
+"""How far from a wall (m) a kinematic robot stops that would bump into it."""
+_GRAZE = 1e-9
+"""A disc that dips less than this (m) into a wall does not touch it."""
+
+
+@njit(cache=True)
+def nearest_wall(segments, x, y):  # type: ignore[no-untyped-def]
+    """Distance from a point to the nearest wall, and the nearest point on it: (distance, px, py); inf without walls."""
+    best, px, py = np.inf, x, y
+    for k in range(segments.shape[0]):
+        ax, ay = segments[k, 0], segments[k, 1]
+        ex, ey = segments[k, 2] - ax, segments[k, 3] - ay
+        length2 = ex * ex + ey * ey
+        t = 0.0
+        if length2 > 0.0:
+            t = min(1.0, max(0.0, ((x - ax) * ex + (y - ay) * ey) / length2))
+        qx, qy = ax + t * ex, ay + t * ey
+        d2 = (qx - x) ** 2 + (qy - y) ** 2
+        if d2 < best:
+            best, px, py = d2, qx, qy
+    return math.sqrt(best), px, py
+
+
+@njit(cache=True)
+def walls_near(segments, x_min, y_min, x_max, y_max):  # type: ignore[no-untyped-def]
+    """Indices of the walls whose bounding box meets the given box."""
+    out, n = np.empty(segments.shape[0], np.int64), 0
+    for k in range(segments.shape[0]):
+        x1, y1, x2, y2 = segments[k]
+        if max(x1, x2) >= x_min and min(x1, x2) <= x_max and max(y1, y2) >= y_min and min(y1, y2) <= y_max:
+            out[n] = k
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True)
+def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
+    """First t in [0, 1] at which the point t (dx, dy) comes within radius of the segment a, b; inf if never.
+
+    At t = 0 it counts only if the point moves closer.
+    """
+    ex, ey = bx - ax, by - ay
+    length2 = ex * ex + ey * ey
+    u = 0.0
+    if length2 > 0.0:
+        u = min(1.0, max(0.0, -(ax * ex + ay * ey) / length2))
+    qx, qy = ax + u * ex, ay + u * ey
+    if qx * qx + qy * qy <= radius * radius:
+        return 0.0 if qx * dx + qy * dy > 0.0 else np.inf
+    first = np.inf
+    if length2 > 0.0:  # the straight sides
+        length = math.sqrt(length2)
+        nx, ny = -ey / length, ex / length
+        height, rate = -(ax * nx + ay * ny), dx * nx + dy * ny  # signed height of the point over the line
+        if height < 0.0:
+            height, rate = -height, -rate
+        if rate < 0.0 and height >= radius:
+            t = (height - radius) / -rate
+            along = ((t * dx - ax) * ex + (t * dy - ay) * ey) / length2
+            if t <= 1.0 and 0.0 <= along <= 1.0:
+                return t
+    square = dx * dx + dy * dy
+    for end in range(2):  # the round ends
+        cx, cy = (ax, ay) if end == 0 else (bx, by)
+        half = cx * dx + cy * dy
+        gap = cx * cx + cy * cy - radius * radius
+        root = half * half - square * gap
+        if half > 0.0 and gap >= 0.0 and root >= 0.0:
+            t = gap / (half + math.sqrt(root))
+            if t <= 1.0:
+                first = min(first, t)
+    return first
+
+
+@njit(cache=True)
+def first_contact(segments, x, y, dx, dy, radius, standoff):  # type: ignore[no-untyped-def]
+    """How far a disc at (x, y) gets along (dx, dy) before it touches a wall.
+
+    Returns (contact, stop): the share of the motion at which it touches, inf if it never does, and the share at
+    which its rim is still `standoff` from that wall (0 if it starts closer). A disc that touches a wall already
+    is only held by it if it moves into it.
+    """
+    contact, stop = np.inf, np.inf
+    reach = radius + standoff
+    x_min, x_max = x + min(0.0, dx) - reach, x + max(0.0, dx) + reach
+    y_min, y_max = y + min(0.0, dy) - reach, y + max(0.0, dy) + reach
+    if dx == 0.0 and dy == 0.0:
+        return contact, stop
+    for k in range(segments.shape[0]):
+        x1, y1, x2, y2 = segments[k]
+        if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
+            continue
+        t = _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, radius - _GRAZE)
+        if t < contact:
+            contact = t
+            stop = min(t, _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
+    return contact, stop
+
+
+@njit(cache=True)
+def profile_time(distance, speed, acceleration):  # type: ignore[no-untyped-def]
+    """Time to cover a distance from rest to rest: a trapezoid of speed, or a triangle if it is short."""
+    if distance >= speed * speed / acceleration:
+        return distance / speed + speed / acceleration
+    return 2.0 * math.sqrt(distance / acceleration)
+
+
+@njit(cache=True)
+def profile_distance(time, distance, speed, acceleration):  # type: ignore[no-untyped-def]
+    """How much of the distance is covered after a time, on the same profile."""
+    total = profile_time(distance, speed, acceleration)
+    if time >= total:
+        return distance
+    ramp = min(speed / acceleration, 0.5 * total)
+    if time <= ramp:
+        return 0.5 * acceleration * time * time
+    if time >= total - ramp:
+        return distance - 0.5 * acceleration * (total - time) ** 2
+    return 0.5 * acceleration * ramp * ramp + acceleration * ramp * (time - ramp)
+
+
+@njit(cache=True)
+def glide(segments, pose, path, heading, final_turn, radius, limits, time_limit):  # type: ignore[no-untyped-def]
+    """Follow path (k, 2) exactly, turning on the spot at its vertices; stop at the first contact or at the time limit.
+
+    limits: speed, turn rate, acceleration, turn acceleration. Returns the trajectory (m, 3), the distance, the
+    time, whether a wall stopped it, and whether it arrived.
+    """
+    speed, rate, acceleration, turn_acceleration = limits
+    out, n = np.empty((2 * path.shape[0] + 2, 3)), 1
+    out[0] = pose
+    distance, time, collided = 0.0, 0.0, False
+    legs = path.shape[0] - 1
+    for k in range(legs + 1):
+        x, y, phi = out[n - 1]
+        last = k == legs
+        if last and not final_turn:
+            break
+        dx, dy = (0.0, 0.0) if last else (path[k + 1, 0] - x, path[k + 1, 1] - y)
+        length = math.hypot(dx, dy)
+        if not last and length == 0.0:
+            continue
+        turn = ((heading if last else math.atan2(dy, dx)) - phi + math.pi) % (2.0 * math.pi) - math.pi
+        if turn != 0.0:
+            left = time_limit - time
+            turned = profile_distance(left, abs(turn), rate, turn_acceleration)
+            out[n] = x, y, phi + math.copysign(turned, turn)
+            n += 1
+            if turned < abs(turn):
+                return out[:n], distance, time_limit, collided, False
+            time += profile_time(abs(turn), rate, turn_acceleration)
+        if last:
+            break
+        contact, stop = first_contact(segments, x, y, dx, dy, radius, STANDOFF)
+        if contact <= 1.0:
+            collided = True
+            dx, dy, length = dx * stop, dy * stop, length * stop
+        driven = profile_distance(time_limit - time, length, speed, acceleration)
+        share = driven / length if length > 0.0 else 0.0
+        distance += driven
+        out[n] = x + dx * share, y + dy * share, out[n - 1, 2]
+        n += 1
+        if driven < length:
+            return out[:n], distance, time_limit, False, False
+        time += profile_time(length, speed, acceleration)
+        if collided:
+            return out[:n], distance, time, True, False
+    return out[:n], distance, time, False, True
