@@ -1,0 +1,180 @@
+"""Films and the live window: pictures in, moving pictures out.
+
+Pillow, imageio and pygame are imported when first needed: `pip install "polyexplore-gym[plots]"`
+for films, `[window]` for the window.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from polyexplore_gym.errors import MissingDependencyError, RenderingError
+
+if TYPE_CHECKING:
+    from polyexplore_gym.snapshot import Snapshot
+
+
+def motion(before: Snapshot, after: Snapshot, step: float = 0.25) -> Iterator[Snapshot]:
+    """The drive between two snapshots, for animations that flow: the robot moves on, the map waits.
+
+    Yields `before` with the robot at every `step` metres along what `after.trajectory` adds;
+    neither `before` nor `after` itself.
+    """
+    new = after.trajectory[max(len(before.trajectory) - 1, 0) :]
+    if len(new) < 2:
+        return
+    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(new[:, :2], axis=0).T))])
+    heading = float(before.pose[2])
+    for at in np.arange(step, lengths[-1], step):
+        k = int(np.searchsorted(lengths, at, side="right"))  # new[k - 1] is passed, new[k] lies ahead
+        a, b = new[k - 1, :2], new[k, :2]
+        here = a + (b - a) * (at - lengths[k - 1]) / (lengths[k] - lengths[k - 1])
+        heading = float(new[k, 2]) if new.shape[1] > 2 else float(np.arctan2(b[1] - a[1], b[0] - a[0]))
+        driven = np.concatenate([before.trajectory[:, :2], new[1:k, :2], here[None]])
+        yield replace(
+            before,
+            pose=np.array([*here, heading]),
+            estimate=None,
+            trajectory=driven,
+            scan=None,
+            distance=before.distance + float(at),
+        )
+
+
+def save_animation(frames: Iterable[np.ndarray], path: str | Path, fps: float = 10.0, hold: float = 1.5) -> None:
+    """Save pictures as .gif or .mp4; the last one stays for `hold` more seconds.
+
+    The frames may come from a generator: they are kept compressed, or go straight to the encoder.
+
+    Raises:
+        MissingDependencyError: Pillow, imageio or imageio-ffmpeg is not installed.
+        RenderingError: the suffix is neither, there are no frames, or they differ in size.
+    """
+    path = Path(path)
+    writers = {".gif": _save_gif, ".mp4": _save_mp4}
+    if path.suffix.lower() not in writers:
+        raise RenderingError(f"{path}: an animation is saved as .gif or .mp4")
+    if not 0.1 <= fps <= 100:
+        raise RenderingError(f"fps = {fps!r}: must lie in 0.1 to 100")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")  # whoever watches the folder sees whole files only
+    try:
+        writers[path.suffix.lower()](_checked(frames), part, fps, hold)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class Window:
+    """A window on the screen that shows frames as they come (pygame, imported when first shown).
+
+    Raises `MissingDependencyError` on the first `show` if pygame is not installed.
+    """
+
+    def __init__(self, title: str = "polyexplore", fps: float | None = None) -> None:
+        self.title = title
+        self.fps = fps
+        """At most so many frames a second; None: as they come."""
+        self.closed = False
+        """Whether the window was closed, by the user or by `close`."""
+        self._screen: Any = None
+        self._clock: Any = None
+
+    def show(self, picture: np.ndarray) -> bool:
+        """Show an (h, w, 3) uint8 picture. False once the window was closed: nothing is shown then."""
+        if self.closed:
+            return False
+        pygame = require("pygame", "window")
+        size = (picture.shape[1], picture.shape[0])
+        if self._screen is None or self._screen.get_size() != size:
+            pygame.display.init()
+            self._screen = pygame.display.set_mode(size)
+            pygame.display.set_caption(self.title)
+            self._clock = pygame.time.Clock()
+        self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture).tobytes(), size, "RGB"), (0, 0))
+        pygame.display.flip()
+        if any(event.type == pygame.QUIT for event in pygame.event.get()):
+            self.close()
+            return False
+        if self.fps is not None:
+            self._clock.tick(self.fps)
+        return True
+
+    def close(self) -> None:
+        """Close the window; more than once does no harm."""
+        if self._screen is not None:
+            require("pygame", "window").display.quit()
+            self._screen = None
+        self.closed = True
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import an optional module; raises `MissingDependencyError` with the extra that brings it."""
+    if module == "pygame":
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        hint = f'pip install "polyexplore-gym[{extra}]"'
+        raise MissingDependencyError(f"this needs {module}, which is not installed: {hint}") from error
+
+
+def _checked(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The frames as contiguous arrays with even sides; raises if they are no pictures of one size."""
+    shape = None
+    for picture in frames:
+        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+            raise RenderingError(f"a frame must be (h, w, 3) uint8, not {picture.shape} {picture.dtype}")
+        if shape is not None and picture.shape != shape:
+            raise RenderingError(f"frames differ in size: {shape} and then {picture.shape}")
+        shape = picture.shape
+        odd = (shape[0] % 2, shape[1] % 2)
+        padded = np.pad(picture, ((0, odd[0]), (0, odd[1]), (0, 0)), mode="edge") if any(odd) else picture
+        yield np.ascontiguousarray(padded)
+    if shape is None:
+        raise RenderingError("no frames to save")
+
+
+def _save_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, hold: float) -> None:
+    imageio = require("imageio", "plots")
+    require("imageio_ffmpeg", "plots")
+    picture = next(frames)  # nothing is written unless there is a first frame
+    settings = {"codec": "libx264", "pixelformat": "yuv420p", "macro_block_size": 2, "output_params": ["-crf", "20"]}
+    with imageio.get_writer(path, format="FFMPEG", mode="I", fps=fps, quality=None, **settings) as writer:
+        writer.append_data(picture)
+        for picture in frames:
+            writer.append_data(picture)
+        for _ in range(round(hold * fps)):
+            writer.append_data(picture)
+
+
+def _save_gif(frames: Iterator[np.ndarray], path: Path, fps: float, hold: float) -> None:
+    require("PIL", "plots")
+    from PIL import Image
+
+    kept, shape = [], (0, 0, 3)
+    for picture in frames:
+        shape = picture.shape
+        kept.append(zlib.compress(picture.tobytes(), 1))
+
+    def picture_at(i: int) -> np.ndarray:
+        return np.frombuffer(zlib.decompress(kept[i]), dtype=np.uint8).reshape(shape)
+
+    # One palette for all frames, or areas at rest would flicker and nothing could be left out between frames.
+    sample = np.unique(np.linspace(0, len(kept) - 1, 8).round().astype(int))
+    palette = Image.fromarray(np.concatenate([picture_at(i) for i in sample])).quantize(255, dither=Image.Dither.NONE)
+    images = (
+        Image.fromarray(picture_at(i)).quantize(palette=palette, dither=Image.Dither.NONE) for i in range(len(kept))
+    )
+    first = next(images)
+    durations = [1000.0 / fps] * len(kept)
+    durations[-1] += 1000.0 * hold
+    first.save(path, save_all=True, append_images=images, duration=durations, loop=0, optimize=True)
