@@ -1,0 +1,187 @@
+"""First guess of a scan's lines: iterative end-point fit with noise-aware splitting.
+
+Runs of neighbouring returns are split where a return leaves the chord between the run's ends by
+more than the noise explains; pieces are then joined again where one line explains both (likelihood
+ratio), and the border between neighbours is moved to where both fit best. Each return ends with
+the label of its piece, or -1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.mapping.fit import fit, normal_variance
+
+SPLIT_GATE = 3.5**2  # squared deviation from the chord over its variance
+JOIN_GATE = 13.8  # chi-square, 2 degrees of freedom, 99.9 %: oversplitting is repaired generously
+BREAK_INCIDENCE = math.radians(80.0)  # neighbouring returns on a wall seen more obliquely start a new run
+
+
+@njit(cache=True)
+def runs(x: np.ndarray, y: np.ndarray, beam: np.ndarray, resolution: float, var_range: float) -> np.ndarray:
+    """(m,) number of the run of each return; a new run starts at a missing return or a wide gap."""
+    m = x.size
+    run = np.zeros(m, np.int64)
+    slope = math.sin(resolution) / math.sin(max(0.5 * math.pi - BREAK_INCIDENCE - resolution, resolution))
+    noise = 3.0 * math.sqrt(2.0 * var_range)
+    for k in range(1, m):
+        reach = slope * min(math.hypot(x[k], y[k]), math.hypot(x[k - 1], y[k - 1])) + noise
+        near = beam[k] == beam[k - 1] + 1 and math.hypot(x[k] - x[k - 1], y[k] - y[k - 1]) <= reach
+        run[k] = run[k - 1] if near else run[k - 1] + 1
+    return run
+
+
+@njit(cache=True)
+def farthest(x: np.ndarray, y: np.ndarray, lo: int, hi: int, var_range: float, var_angle: float) -> tuple[int, float]:
+    """The return between lo and hi farthest from their chord, and the largest squared normalised deviation."""
+    ux, uy = x[hi] - x[lo], y[hi] - y[lo]
+    length = math.hypot(ux, uy)
+    if length == 0.0:
+        return (lo + hi) // 2, math.inf
+    ux, uy = ux / length, uy / length
+    ca, sa = -uy, ux
+    v_lo = normal_variance(x[lo], y[lo], ca, sa, var_range, var_angle)
+    v_hi = normal_variance(x[hi], y[hi], ca, sa, var_range, var_angle)
+    best, far, worst = lo + 1, -1.0, 0.0
+    for k in range(lo + 1, hi):
+        dx, dy = x[k] - x[lo], y[k] - y[lo]
+        off = abs(dx * ca + dy * sa)
+        t = (dx * ux + dy * uy) / length
+        v = normal_variance(x[k], y[k], ca, sa, var_range, var_angle)
+        v += (1.0 - t) * (1.0 - t) * v_lo + t * t * v_hi
+        worst = max(worst, off * off / v)
+        if off > far:
+            best, far = k, off
+    return best, worst
+
+
+@njit(cache=True)
+def split(x: np.ndarray, y: np.ndarray, run: np.ndarray, var_range: float, var_angle: float) -> np.ndarray:
+    """(p, 2) first and last return of each piece, in beam order."""
+    m = x.size
+    pieces = np.empty((m, 2), np.int64)
+    count = 0
+    stack = np.empty((m + 1, 2), np.int64)
+    start = 0
+    while start < m:
+        stop = start
+        while stop + 1 < m and run[stop + 1] == run[start]:
+            stop += 1
+        stack[0, 0], stack[0, 1] = start, stop
+        top = 1
+        while top > 0:
+            top -= 1
+            lo, hi = stack[top, 0], stack[top, 1]
+            k, worst = (lo, 0.0) if hi - lo < 2 else farthest(x, y, lo, hi, var_range, var_angle)
+            if worst <= SPLIT_GATE:
+                pieces[count, 0], pieces[count, 1] = lo, hi
+                count += 1
+                continue
+            # the corner return goes to the side it lies nearer to
+            left = math.hypot(x[k] - x[k - 1], y[k] - y[k - 1]) <= math.hypot(x[k + 1] - x[k], y[k + 1] - y[k])
+            cut = k if left else k - 1
+            stack[top, 0], stack[top, 1] = cut + 1, hi
+            stack[top + 1, 0], stack[top + 1, 1] = lo, cut
+            top += 2
+        start = stop + 1
+    return pieces[:count]
+
+
+@njit(cache=True)
+def join(
+    x: np.ndarray, y: np.ndarray, run: np.ndarray, pieces: np.ndarray, var_range: float, var_angle: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join neighbouring pieces of a run which one line explains. Returns pieces, rho, alpha (3 returns and more)."""
+    p = 0
+    box = np.empty((pieces.shape[0], 2), np.int64)
+    line = np.empty((pieces.shape[0], 3))  # rho, alpha, chi-square
+    order = np.arange(x.size)
+    for q in range(pieces.shape[0]):
+        if pieces[q, 1] - pieces[q, 0] >= 2:
+            box[p, 0], box[p, 1] = pieces[q, 0], pieces[q, 1]
+            rho, alpha, _, _, _, chi2 = fit(x, y, order[box[p, 0] : box[p, 1] + 1], var_range, var_angle)
+            line[p, 0], line[p, 1], line[p, 2] = rho, alpha, chi2
+            p += 1
+    changed = True
+    while changed:
+        changed = False
+        kept = 0
+        for q in range(p):
+            if kept > 0 and run[box[kept - 1, 0]] == run[box[q, 0]] and box[q, 0] - box[kept - 1, 1] <= 3:
+                joint = order[box[kept - 1, 0] : box[q, 1] + 1]
+                rho, alpha, _, _, _, chi2 = fit(x, y, joint, var_range, var_angle)
+                between = box[q, 0] - box[kept - 1, 1] - 1
+                if chi2 - line[kept - 1, 2] - line[q, 2] < JOIN_GATE + 4.0 * between:
+                    box[kept - 1, 1] = box[q, 1]
+                    line[kept - 1, 0], line[kept - 1, 1], line[kept - 1, 2] = rho, alpha, chi2
+                    changed = True
+                    continue
+            box[kept], line[kept] = box[q], line[q]
+            kept += 1
+        p = kept
+    return box[:p], line[:p, 0].copy(), line[:p, 1].copy()
+
+
+@njit(cache=True)
+def sharpen(
+    x: np.ndarray,
+    y: np.ndarray,
+    run: np.ndarray,
+    pieces: np.ndarray,
+    rho: np.ndarray,
+    alpha: np.ndarray,
+    var_range: float,
+    var_angle: float,
+) -> None:
+    """Move the border between neighbouring pieces to where the squared normalised residuals are least."""
+    for q in range(pieces.shape[0] - 1):
+        a_hi, b_lo = pieces[q, 1], pieces[q + 1, 0]
+        if run[a_hi] != run[b_lo]:
+            continue
+        lo = max(pieces[q, 0] + 2, a_hi - 8)
+        hi = min(pieces[q + 1, 1] - 2, b_lo + 8)
+        ca, sa, cb, sb = math.cos(alpha[q]), math.sin(alpha[q]), math.cos(alpha[q + 1]), math.sin(alpha[q + 1])
+        # border k: returns up to k belong to the first piece; the cost is relative to border lo
+        cost, best, border = 0.0, 0.0, lo
+        for k in range(lo + 1, hi):
+            ea = x[k] * ca + y[k] * sa - rho[q]
+            eb = x[k] * cb + y[k] * sb - rho[q + 1]
+            cost += ea * ea / normal_variance(x[k], y[k], ca, sa, var_range, var_angle)
+            cost -= eb * eb / normal_variance(x[k], y[k], cb, sb, var_range, var_angle)
+            if cost < best:
+                best, border = cost, k
+        if hi > lo:
+            pieces[q, 1], pieces[q + 1, 0] = border, border + 1
+
+
+@njit(cache=True)
+def endpoint_labels(
+    x: np.ndarray,
+    y: np.ndarray,
+    beam: np.ndarray,
+    resolution: float,
+    var_range: float,
+    var_angle: float,
+    min_points: int,
+    min_length: float,
+) -> tuple[np.ndarray, int]:
+    """(m,) label of the piece each return lies on (-1 none) and the number of pieces."""
+    run = runs(x, y, beam, resolution, var_range)
+    pieces = split(x, y, run, var_range, var_angle)
+    pieces, rho, alpha = join(x, y, run, pieces, var_range, var_angle)
+    sharpen(x, y, run, pieces, rho, alpha, var_range, var_angle)
+    label = np.full(x.size, -1, np.int64)
+    count = 0
+    for q in range(pieces.shape[0]):
+        lo, hi = pieces[q, 0], pieces[q, 1]
+        if hi - lo + 1 < min_points:
+            continue
+        sa, ca = math.sin(alpha[q]), math.cos(alpha[q])
+        if abs((x[hi] - x[lo]) * sa - (y[hi] - y[lo]) * ca) < min_length:
+            continue
+        label[lo : hi + 1] = count
+        count += 1
+    return label, count

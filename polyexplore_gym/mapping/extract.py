@@ -1,0 +1,219 @@
+"""One scan to lines: `extract_lines`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.config import MappingConfig, SensorConfig
+from polyexplore_gym.mapping.endpoint import endpoint_labels
+from polyexplore_gym.mapping.fragments import fragment_chains
+from polyexplore_gym.mapping.grouping import UNDECIDED, attach, cut, fit_labels, group_collinear
+
+COLLINEAR_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
+LEAST_RANGE_NOISE = 1e-3  # m; a noise-free sensor is fitted with these, so that weights stay finite
+LEAST_ANGLE_NOISE = 1e-4  # rad
+
+
+@dataclass(frozen=True, slots=True)
+class ScanLines:
+    """The lines of one scan, in the robot frame. L lines carry K segments; n beams; F fragments."""
+
+    rho: np.ndarray
+    """(L,) distance of the line from the robot, m, >= 0: x cos(alpha) + y sin(alpha) = rho."""
+    alpha: np.ndarray
+    """(L,) direction of the normal, away from the robot, rad in (-pi, pi]."""
+    covariance: np.ndarray
+    """(L, 2, 2) covariance in the order (alpha, rho): rad2, rad m, m2."""
+    segments: np.ndarray
+    """(K, 4) end points x1, y1, x2, y2 of the pieces of wall on the lines, m."""
+    segment_line: np.ndarray
+    """(K,) index of the line of each segment."""
+    point_segment: np.ndarray
+    """(n,) index of the segment the return of each beam lies on, -1 for none."""
+    fragments: np.ndarray
+    """(F, 4) short pieces joining neighbouring leftover returns, m: obstacles without a trusted covariance."""
+    smoothed: np.ndarray
+    """(n,) ranges with each return on a line put where its nominal beam meets the line, m (not above 80 degrees)."""
+
+
+def extract_lines(
+    angles: np.ndarray,
+    ranges: np.ndarray,
+    sensor: SensorConfig | None = None,
+    config: MappingConfig | None = None,
+) -> ScanLines:
+    """Fit lines with covariances to one scan.
+
+    A first guess (`config.start`) labels the returns; weighted fits, grouping of collinear lines,
+    attachment of free returns within 3 sigma and cutting at doorways follow. See DESIGN section 4
+    for the equations and their sources.
+
+    Args:
+        angles: (n,) nominal beam angles in the robot frame, rad, strictly increasing.
+        ranges: (n,) measured ranges, m, positive; inf, or anything from the sensor's maximum
+            range on, is a beam without a return.
+        sensor: noise, maximum range, and whether the field of view closes.
+        config: numbers and limits of the fit.
+
+    Raises:
+        ValueError: the arrays are not one-dimensional, differ in length, hold NaN, an angle is not
+            finite or not increasing, or a range is not positive.
+
+    Example:
+        >>> import numpy as np
+        >>> from polyexplore_gym.config import SensorConfig
+        >>> from polyexplore_gym.mapping import extract_lines
+        >>> angles = np.linspace(-0.5, 0.5, 101)
+        >>> lines = extract_lines(angles, 2.0 / np.cos(angles), SensorConfig(sigma_range=0.01))
+        >>> lines.rho.round(3), lines.alpha.round(3) + 0.0, lines.segments.shape
+        (array([2.]), array([0.]), (1, 4))
+    """
+    sensor = SensorConfig() if sensor is None else sensor
+    config = MappingConfig() if config is None else config
+    angles = np.ascontiguousarray(angles, np.float64)
+    ranges = np.ascontiguousarray(ranges, np.float64)
+    if angles.ndim != 1 or ranges.ndim != 1:
+        raise ValueError(f"angles and ranges must be one-dimensional, got shapes {angles.shape} and {ranges.shape}")
+    if angles.size != ranges.size:
+        raise ValueError(f"angles and ranges differ in length: {angles.size} and {ranges.size}")
+    problem, beam = _check(angles, ranges)
+    if problem:
+        raise ValueError(_PROBLEMS[problem].format(beam=beam, angle=angles[beam], range=ranges[beam]))
+    sigma_range = max(math.hypot(sensor.sigma_range, config.range_floor), LEAST_RANGE_NOISE)
+    sigma_angle = max(sensor.sigma_angle, LEAST_ANGLE_NOISE)
+    start, points = _returns(angles, ranges, sensor.max_range, sensor.full_circle)
+    resolution = (angles[-1] - angles[0]) / (angles.size - 1) if angles.size > 1 else sensor.resolution
+    x, y, beam_of, reach_of, cos_t, sin_t = points
+    label, count = endpoint_labels(
+        x, y, beam_of, resolution, sigma_range**2, sigma_angle**2, config.min_points, config.min_length
+    )
+    return ScanLines(
+        *_assemble(
+            x, y, beam_of, reach_of, cos_t, sin_t, start, sensor.max_range, resolution, label, count,
+            sigma_range, sigma_angle, config.door_width, config.min_points, config.min_length,
+        )
+    )  # fmt: skip
+
+
+_PROBLEMS = {
+    1: "range of beam {beam} is NaN; give inf for a beam without a return",
+    2: "range of beam {beam} is {range}; ranges must be positive",
+    3: "angle of beam {beam} is {angle}; angles must be finite",
+    4: "angle of beam {beam} is {angle}, not larger than the one before; angles must increase strictly",
+}
+
+
+@njit(cache=True)
+def _check(angles: np.ndarray, ranges: np.ndarray) -> tuple[int, int]:
+    """Number of the first problem found (0 none) and its beam."""
+    for k in range(angles.size):
+        if math.isnan(ranges[k]):
+            return 1, k
+        if ranges[k] <= 0.0:
+            return 2, k
+        if not math.isfinite(angles[k]):
+            return 3, k
+        if k > 0 and angles[k] <= angles[k - 1]:
+            return 4, k
+    return 0, 0
+
+
+@njit(cache=True)
+def _returns(
+    angles: np.ndarray, ranges: np.ndarray, max_range: float, full_circle: bool
+) -> tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """First beam of a turned scan, and x, y, beam of its returns, and ranges, cos, sin of its beams.
+
+    A full circle is turned so that it starts at its widest discontinuity: no wall then runs over
+    the seam, where possible.
+    """
+    n = angles.size
+    start = 0
+    if full_circle:
+        widest = -1.0
+        for k in range(n):
+            a, b = min(ranges[k - 1], 2.0 * max_range), min(ranges[k], 2.0 * max_range)
+            if abs(a - b) / min(a, b) > widest:
+                start, widest = k, abs(a - b) / min(a, b)
+    turned, cos_t, sin_t = np.empty(n), np.empty(n), np.empty(n)
+    x, y, beam = np.empty(n), np.empty(n), np.empty(n, np.int64)
+    m = 0
+    for q in range(n):
+        k = (start + q) % n
+        c, s = math.cos(angles[k]), math.sin(angles[k])
+        d = ranges[k] if ranges[k] < max_range else math.inf
+        turned[q], cos_t[q], sin_t[q] = d, c, s
+        if d < math.inf:
+            x[m], y[m], beam[m] = d * c, d * s, q
+            m += 1
+    return start, (x[:m].copy(), y[:m].copy(), beam[:m].copy(), turned, cos_t, sin_t)
+
+
+@njit(cache=True)
+def _assemble(
+    x: np.ndarray,
+    y: np.ndarray,
+    beam: np.ndarray,
+    ranges: np.ndarray,
+    cos_t: np.ndarray,
+    sin_t: np.ndarray,
+    start: int,
+    max_range: float,
+    resolution: float,
+    label: np.ndarray,
+    count: int,
+    sigma_range: float,
+    sigma_angle: float,
+    reach: float,
+    min_points: int,
+    min_length: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Labelled returns to the fields of `ScanLines`."""
+    var_range, var_angle = sigma_range * sigma_range, sigma_angle * sigma_angle
+    fits = fit_labels(x, y, label, count, var_range, var_angle)
+    group_collinear(x, y, label, fits, var_range, var_angle, COLLINEAR_GATE)
+    attach(x, y, label, fits, var_range, var_angle, reach)
+    fits = fit_labels(x, y, label, count, var_range, var_angle)
+    where, segments, owner = cut(
+        x, y, beam, ranges, cos_t, sin_t, max_range, resolution, label, fits,
+        sigma_range, sigma_angle, reach, min_points, min_length,
+    )  # fmt: skip
+    fragments = fragment_chains(x, y, beam, where, resolution, var_range, var_angle)
+
+    number = np.full(count, -1, np.int64)
+    lines = 0
+    for i in range(count):
+        if fits[i, 8] >= min_points:
+            number[i] = lines
+            lines += 1
+    rho, alpha, covariance = np.empty(lines), np.empty(lines), np.empty((lines, 2, 2))
+    for i in range(count):
+        q = number[i]
+        if q >= 0:
+            rho[q], alpha[q] = fits[i, 0], fits[i, 1]
+            covariance[q, 0, 0] = fits[i, 2]
+            covariance[q, 0, 1] = covariance[q, 1, 0] = fits[i, 3]
+            covariance[q, 1, 1] = fits[i, 4]
+    n = ranges.size
+    point_segment = np.full(n, -1, np.int64)
+    smoothed = np.empty(n)
+    for q in range(n):
+        smoothed[(start + q) % n] = ranges[q]
+    for k in range(x.size):
+        if where[k] < 0:
+            continue
+        q = beam[k]
+        at = (start + q) % n
+        point_segment[at] = where[k]
+        i = owner[where[k]]
+        c = cos_t[q] * math.cos(fits[i, 1]) + sin_t[q] * math.sin(fits[i, 1])
+        if c > UNDECIDED:
+            smoothed[at] = fits[i, 0] / c
+    segment_line = np.empty(owner.size, np.int64)
+    for k in range(owner.size):
+        segment_line[k] = number[owner[k]]
+    return rho, alpha, covariance, segments, segment_line, point_segment, fragments, smoothed

@@ -1,0 +1,76 @@
+"""Obstacles without a trusted line: short pieces that join neighbouring leftover returns."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+OBLIQUE = 1.0 / math.cos(math.radians(70.0))  # neighbouring leftover returns are joined up to this incidence
+COARSEST = 0.2  # largest simplification tolerance, m
+
+
+@njit(cache=True)
+def simplify(
+    x: np.ndarray, y: np.ndarray, lo: int, hi: int, var_range: float, var_angle: float, out: np.ndarray, count: int
+) -> int:
+    """Append the pieces of the chain lo..hi to out, simplified (Douglas-Peucker) to 3 sigma. Returns the new count."""
+    stack = [(lo, hi)]
+    while len(stack) > 0:
+        a, b = stack.pop()
+        ux, uy = x[b] - x[a], y[b] - y[a]
+        length = math.hypot(ux, uy)
+        best, far = -1, 1.0
+        for k in range(a + 1, b):
+            dx, dy = x[k] - x[a], y[k] - y[a]
+            t = 0.0 if length == 0.0 else min(max((dx * ux + dy * uy) / (length * length), 0.0), 1.0)
+            off = math.hypot(dx - t * ux, dy - t * uy)
+            tolerance = min(3.0 * math.sqrt(var_range + var_angle * (x[k] * x[k] + y[k] * y[k])), COARSEST)
+            if off / tolerance > far:
+                best, far = k, off / tolerance
+        if best >= 0:
+            stack.append((best, b))
+            stack.append((a, best))
+        else:
+            out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x[a], y[a], x[b], y[b]
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def fragment_chains(
+    x: np.ndarray,
+    y: np.ndarray,
+    beam: np.ndarray,
+    where: np.ndarray,
+    resolution: float,
+    var_range: float,
+    var_angle: float,
+) -> np.ndarray:
+    """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width."""
+    m = x.size
+    out = np.empty((m, 4))
+    count = 0
+    noise = 3.0 * math.sqrt(2.0 * var_range)
+    k = 0
+    while k < m:
+        if where[k] >= 0:
+            k += 1
+            continue
+        stop = k
+        while stop + 1 < m and where[stop + 1] < 0 and beam[stop + 1] == beam[stop] + 1:
+            d = min(math.hypot(x[stop], y[stop]), math.hypot(x[stop + 1], y[stop + 1]))
+            if math.hypot(x[stop + 1] - x[stop], y[stop + 1] - y[stop]) > OBLIQUE * resolution * d + noise:
+                break
+            stop += 1
+        if stop == k:
+            d = math.hypot(x[k], y[k])
+            half = 0.5 * max(resolution, 0.01 / d)
+            out[count, 0], out[count, 1] = x[k] + half * y[k], y[k] - half * x[k]
+            out[count, 2], out[count, 3] = x[k] - half * y[k], y[k] + half * x[k]
+            count += 1
+        else:
+            count = simplify(x, y, k, stop, var_range, var_angle, out, count)
+        k = stop + 1
+    return out[:count].copy()

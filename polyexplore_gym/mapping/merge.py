@@ -1,0 +1,498 @@
+"""Kernels of the line map: association, fusion, intervals of wall on a line, fragments."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
+from polyexplore_gym.mapping.grid import Grid, grid_put, grid_query, grid_remove
+
+MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
+STILL = 2e-3  # m; a row whose ends move less counts as untouched
+COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
+BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
+LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end along its line
+
+
+class Rows(NamedTuple):
+    """Segments in slots, one entry a row."""
+
+    segments: np.ndarray
+    """(M, 4) as published: end points, free space seen on the left."""
+    ends: np.ndarray
+    """(M, 4) the same to the last bit; `segments` follows in steps of 2 mm or more."""
+    end_variance: np.ndarray
+    """(M, 2) variance of each end along the line, m2."""
+    alive: np.ndarray
+    line: np.ndarray
+    """(M,) line slot, -1 for a fragment."""
+    side: np.ndarray
+    """(M,) 1: seen from the side of the map's origin, -1: from beyond the line; 0 for a fragment."""
+    sigma: np.ndarray
+    """(M,) standard deviation across the segment, m."""
+    next: np.ndarray
+    """(M,) next row on the same line, -1 at the end."""
+    touched: np.ndarray
+    """(M,) number of the insert that touched the row last."""
+
+
+class Lines(NamedTuple):
+    """Lines in slots."""
+
+    rho: np.ndarray
+    alpha: np.ndarray
+    covariance: np.ndarray
+    alive: np.ndarray
+    side: np.ndarray
+    first: np.ndarray
+    """First row on the line, -1 for none."""
+
+
+class Slots(NamedTuple):
+    """Free slots, used last in first out, and counters."""
+
+    rows: np.ndarray
+    lines: np.ndarray
+    count: np.ndarray
+    """Number of free rows, free lines, inserts so far, touched rows of this insert."""
+    touched: np.ndarray
+    """Rows touched in this insert."""
+
+
+@njit(cache=True)
+def oriented(lines: Lines, i: int) -> tuple[float, float, np.ndarray]:
+    """The line with its normal pointing away from where it was seen (rho may be negative)."""
+    p = lines.covariance[i]
+    if lines.side[i] > 0:
+        return lines.rho[i], lines.alpha[i], p
+    q = p.copy()
+    q[0, 1], q[1, 0] = -p[0, 1], -p[1, 0]
+    return -lines.rho[i], wrap(lines.alpha[i] + math.pi), q
+
+
+@njit(cache=True)
+def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray) -> None:
+    """Write an oriented line into its slot with rho >= 0 and the side it was seen from."""
+    lines.covariance[i, 0, 0], lines.covariance[i, 1, 1] = p[0, 0], p[1, 1]
+    if rho < 0.0:
+        lines.rho[i], lines.alpha[i], lines.side[i] = -rho, wrap(alpha + math.pi), -1
+        lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = -p[0, 1]
+    else:
+        lines.rho[i], lines.alpha[i], lines.side[i] = rho, wrap(alpha), 1
+        lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = p[0, 1]
+
+
+@njit(cache=True)
+def touch(rows: Rows, slots: Slots, row: int) -> None:
+    if rows.touched[row] != slots.count[2]:
+        rows.touched[row] = slots.count[2]
+        slots.touched[slots.count[3]] = row
+        slots.count[3] += 1
+
+
+@njit(cache=True)
+def new_row(rows: Rows, slots: Slots) -> int:
+    slots.count[0] -= 1
+    row = slots.rows[slots.count[0]]
+    rows.alive[row] = True
+    rows.segments[row] = math.inf
+    return row
+
+
+@njit(cache=True)
+def free_row(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
+    rows.alive[row] = False
+    rows.line[row] = -1
+    rows.side[row] = 0
+    slots.rows[slots.count[0]] = row
+    slots.count[0] += 1
+    grid_remove(grid, row)
+    touch(rows, slots, row)
+
+
+@njit(cache=True)
+def publish(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
+    """Bring the published segment up to date if an end moved by 2 mm or more."""
+    e, s = rows.ends[row], rows.segments[row]
+    still = math.hypot(e[0] - s[0], e[1] - s[1]) < STILL and math.hypot(e[2] - s[2], e[3] - s[3]) < STILL
+    if not still:
+        rows.segments[row] = e
+        grid_put(grid, row, e[0], e[1], e[2], e[3])
+        touch(rows, slots, row)
+
+
+@njit(cache=True)
+def segment_distance(px: float, py: float, s: np.ndarray) -> float:
+    dx, dy = s[2] - s[0], s[3] - s[1]
+    q = dx * dx + dy * dy
+    t = 0.0 if q == 0.0 else min(max(((px - s[0]) * dx + (py - s[1]) * dy) / q, 0.0), 1.0)
+    return math.hypot(px - s[0] - t * dx, py - s[1] - t * dy)
+
+
+@njit(cache=True)
+def interval_gap(s: np.ndarray, r: np.ndarray, ux: float, uy: float) -> float:
+    """Gap between two segments along the direction u, m; negative where they overlap."""
+    a, b = s[0] * ux + s[1] * uy, s[2] * ux + s[3] * uy
+    c, d = r[0] * ux + r[1] * uy, r[2] * ux + r[3] * uy
+    return max(min(c, d) - max(a, b), min(a, b) - max(c, d))
+
+
+@njit(cache=True)
+def box_query(grid: Grid, s: np.ndarray, margin: float, out: np.ndarray) -> int:
+    return grid_query(
+        grid,
+        min(s[0], s[2]) - margin,
+        min(s[1], s[3]) - margin,
+        max(s[0], s[2]) + margin,
+        max(s[1], s[3]) + margin,
+        out,
+    )
+
+
+@njit(cache=True)
+def candidates(
+    rho: float,
+    alpha: float,
+    p: np.ndarray,
+    segments: np.ndarray,
+    of: np.ndarray,
+    i: int,
+    rows: Rows,
+    lines: Lines,
+    grid: Grid,
+    gate: float,
+    door: float,
+    found: np.ndarray,
+    out: np.ndarray,
+) -> tuple[int, float]:
+    """Map lines that pass the merge test with new line i (map frame): the best first. Returns number and its d2.
+
+    Each row of `out` is line slot, d2, x, y of the middle between the pieces compared.
+    """
+    ux, uy = -math.sin(alpha), math.cos(alpha)
+    count = 0
+    for k in range(of.size):
+        if of[k] != i:
+            continue
+        s = segments[k]
+        for q in range(box_query(grid, s, door, found)):
+            row = found[q]
+            j = rows.line[row]
+            if j < 0:
+                continue
+            r = rows.segments[row]
+            if interval_gap(s, r, ux, uy) >= door:
+                continue
+            known = False
+            for c in range(count):
+                known = known or out[c, 0] == j
+            if known or count == out.shape[0]:
+                continue
+            rho_j, alpha_j, p_j = oriented(lines, j)
+            if abs(wrap(alpha - alpha_j)) > MAX_TURN:
+                continue
+            x, y = 0.25 * (s[0] + s[2] + r[0] + r[2]), 0.25 * (s[1] + s[3] + r[1] + r[3])
+            d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
+            if d2 < gate:
+                at = count
+                while at > 0 and (out[at - 1, 1] > d2 or (out[at - 1, 1] == d2 and out[at - 1, 0] > j)):
+                    out[at] = out[at - 1]
+                    at -= 1
+                out[at, 0], out[at, 1], out[at, 2], out[at, 3] = j, d2, x, y
+                count += 1
+    return count, out[0, 1] if count > 0 else math.inf
+
+
+@njit(cache=True)
+def fused_end(old: float, v_old: float, new: float, v_new: float, outward: float) -> tuple[float, float]:
+    """End of a segment from two sightings: their mean where they agree, else the outer one.
+
+    The mere maximum would grow by noise with every scan and close doorways.
+    """
+    if (new - old) ** 2 <= 9.0 * (v_old + v_new):
+        v = v_old * v_new / (v_old + v_new)
+        return (old * v_new + new * v_old) / (v_old + v_new), max(v, LEAST_END**2)
+    if (new - old) * outward > 0.0:
+        return new, v_new
+    return old, v_old
+
+
+@njit(cache=True)
+def lay(
+    line: int,
+    fresh: np.ndarray,
+    n_fresh: int,
+    rows: Rows,
+    lines: Lines,
+    grid: Grid,
+    slots: Slots,
+    door: float,
+) -> None:
+    """Lay the rows of a line, and fresh pieces (x1, y1, x2, y2, var1, var2), on the line; join what overlaps."""
+    rho, alpha, p = oriented(lines, line)
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    total = n_fresh
+    row = lines.first[line]
+    while row >= 0:
+        total += 1
+        row = rows.next[row]
+    # low, high, var low, var high, row (-1 fresh, -2 absorbed)
+    span = np.empty((total, 5))
+    n = 0
+    row = lines.first[line]
+    while row >= 0:
+        e = rows.ends[row]
+        span[n, 0], span[n, 1] = e[1] * ca - e[0] * sa, e[3] * ca - e[2] * sa
+        span[n, 2], span[n, 3], span[n, 4] = rows.end_variance[row, 0], rows.end_variance[row, 1], row
+        n += 1
+        row = rows.next[row]
+    for k in range(n_fresh):
+        f = fresh[k]
+        low, high, v_low, v_high = f[1] * ca - f[0] * sa, f[3] * ca - f[2] * sa, f[4], f[5]
+        keep, keep_at = -1, -1
+        # pieces it meets, joined from the lowest row up
+        met = True
+        while met:
+            met = False
+            best = -1
+            for q in range(n):
+                if span[q, 4] == -2:
+                    continue
+                gap = max(span[q, 0] - high, low - span[q, 1])
+                v = span[q, 2] + v_high if span[q, 0] > high else span[q, 3] + v_low
+                if gap <= min(BRIDGE + 3.0 * math.sqrt(v), 0.5 * door) and (best < 0 or span[q, 0] < span[best, 0]):
+                    best = q
+            if best >= 0:
+                met = True
+                low, v_low = fused_end(span[best, 0], span[best, 2], low, v_low, -1.0)
+                high, v_high = fused_end(span[best, 1], span[best, 3], high, v_high, 1.0)
+                if span[best, 4] >= 0:
+                    if keep < 0:
+                        keep = int(span[best, 4])
+                    else:
+                        free_row(rows, grid, slots, int(span[best, 4]))
+                span[best, 4] = -2
+                keep_at = best
+        at = keep_at if keep_at >= 0 else n
+        n = max(n, at + 1)
+        span[at, 0], span[at, 1], span[at, 2], span[at, 3] = low, high, v_low, v_high
+        span[at, 4] = keep
+    lines.first[line] = -1
+    for q in range(n - 1, -1, -1):
+        if span[q, 4] == -2:
+            continue
+        row = int(span[q, 4])
+        if row < 0:
+            row = new_row(rows, slots)
+        rows.line[row] = line
+        rows.side[row] = lines.side[line]
+        rows.next[row] = lines.first[line]
+        lines.first[line] = row
+        e = rows.ends[row]
+        e[0], e[1] = rho * ca - span[q, 0] * sa, rho * sa + span[q, 0] * ca
+        e[2], e[3] = rho * ca - span[q, 1] * sa, rho * sa + span[q, 1] * ca
+        rows.end_variance[row, 0], rows.end_variance[row, 1] = span[q, 2], span[q, 3]
+        x, y = 0.5 * (e[0] + e[2]), 0.5 * (e[1] + e[3])
+        h = x * sa - y * ca
+        rows.sigma[row] = math.sqrt(max(p[1, 1] + 2.0 * h * p[0, 1] + h * h * p[0, 0], 0.0))
+        publish(rows, grid, slots, row)
+
+
+@njit(cache=True)
+def covered(
+    s: np.ndarray, sigma: float, side_alpha: float, any_side: bool, rows: Rows, lines: Lines, grid: Grid, stamp: int,
+    found: np.ndarray,
+) -> tuple[float, float]:  # fmt: skip
+    """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a > b if none.
+
+    Rows touched first in insert `stamp` that are fragments do not count: they come from the same scan.
+    With any_side False only rows seen from the same side (normal direction side_alpha) count.
+    """
+    tolerance = COVER + 3.0 * sigma
+    n = box_query(grid, s, tolerance, found)
+    length = math.hypot(s[2] - s[0], s[3] - s[1])
+    steps = max(1, int(math.ceil(length / 0.05)))
+    first, last = 2.0, -1.0
+    for i in range(steps + 1):
+        t = i / steps
+        px, py = s[0] + t * (s[2] - s[0]), s[1] + t * (s[3] - s[1])
+        hit = False
+        for q in range(n):
+            row = found[q]
+            j = rows.line[row]
+            if j < 0:
+                if not any_side or rows.touched[row] == stamp:
+                    continue
+            elif not any_side:
+                _, alpha, _ = oriented(lines, j)
+                if abs(wrap(alpha - side_alpha)) > MAX_TURN:
+                    continue
+            if segment_distance(px, py, rows.segments[row]) <= tolerance:
+                hit = True
+                break
+        if not hit:
+            first, last = min(first, t), max(last, t)
+    return first, last
+
+
+@njit(cache=True)
+def insert(
+    rho: np.ndarray,
+    alpha: np.ndarray,
+    covariance: np.ndarray,
+    segments: np.ndarray,
+    segment_line: np.ndarray,
+    fragments: np.ndarray,
+    pose: np.ndarray,
+    pose_covariance: np.ndarray,
+    var_range: float,
+    var_angle: float,
+    gate: float,
+    door: float,
+    rows: Rows,
+    lines: Lines,
+    grid: Grid,
+    slots: Slots,
+) -> None:
+    """Insert one scan's lines and fragments; the touched rows are left in `slots`."""
+    slots.count[2] += 1
+    slots.count[3] = 0
+    stamp = slots.count[2]
+    n = rho.size
+    found = np.empty(rows.alive.size, np.int64)
+    match = np.empty((32, 4))
+    rho, alpha, covariance, of = rho.copy(), alpha.copy(), covariance.copy(), segment_line.copy()
+
+    # ends in the map frame, with their variance along the line
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    placed = np.empty((segments.shape[0], 6))
+    var_xy = 0.5 * (pose_covariance[0, 0] + pose_covariance[1, 1])
+    for k in range(segments.shape[0]):
+        ca, sa = math.cos(alpha[of[k]]), math.sin(alpha[of[k]])
+        for e in range(2):
+            x, y = segments[k, 2 * e], segments[k, 2 * e + 1]
+            placed[k, 2 * e], placed[k, 2 * e + 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
+            d2 = x * x + y * y
+            dc, psi = x * ca + y * sa, x * sa - y * ca
+            v_normal = var_range * dc * dc / d2 + var_angle * psi * psi
+            v = var_range * var_angle * d2 / v_normal + var_xy + pose_covariance[2, 2] * d2
+            placed[k, 4 + e] = max(v, LEAST_END**2)
+
+    # new lines that meet the same map line share this scan's pose error: merge them in the scan's frame first
+    best = np.full(n, -1, np.int64)
+    score = np.full(n, math.inf)
+    for i in range(n):
+        r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
+        count, d2 = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, found, match)
+        if count == 0:
+            continue
+        best[i], score[i] = int(match[0, 0]), d2
+        for j in range(i):
+            if best[j] != best[i]:
+                continue
+            x, y, pieces = 0.0, 0.0, 0
+            for k in range(of.size):
+                if of[k] == i or of[k] == j:
+                    x += 0.5 * (segments[k, 0] + segments[k, 2])
+                    y += 0.5 * (segments[k, 1] + segments[k, 3])
+                    pieces += 1
+            x, y = x / pieces, y / pieces
+            if distance2(rho[j], alpha[j], covariance[j], rho[i], alpha[i], covariance[i], x, y) < gate:
+                rho[j], alpha[j], covariance[j] = fuse(
+                    rho[j], alpha[j], covariance[j], rho[i], alpha[i], covariance[i], x, y
+                )
+                of[of == i] = j
+                best[i] = -2
+            elif score[i] < score[j]:
+                best[j] = -1
+            else:
+                best[i] = -1
+            break
+
+    fresh = np.empty((segments.shape[0], 6))
+    for i in range(n):
+        if best[i] == -2:
+            continue
+        r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
+        target, count = -1, 0
+        if best[i] >= 0:
+            count, _ = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, found, match)
+        for q in range(count):
+            j = int(match[q, 0])
+            rho_j, alpha_j, p_j = oriented(lines, j)
+            x, y = match[q, 2], match[q, 3]
+            if target < 0:
+                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+                target = j
+            elif distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
+                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+                lines.alive[j] = False
+                slots.lines[slots.count[1]] = j
+                slots.count[1] += 1
+                # its rows become fresh pieces of the target below
+                row = lines.first[j]
+                while row >= 0:
+                    after = rows.next[row]
+                    rows.next[row] = lines.first[target]
+                    lines.first[target] = row
+                    row = after
+                lines.first[j] = -1
+        m = 0
+        for k in range(of.size):
+            if of[k] != i:
+                continue
+            if target < 0:
+                h = 0.5 * (placed[k, 0] + placed[k, 2]) * math.sin(a0) - 0.5 * (placed[k, 1] + placed[k, 3]) * math.cos(
+                    a0
+                )
+                sigma = math.sqrt(max(p0[1, 1] + 2.0 * h * p0[0, 1] + h * h * p0[0, 0], 0.0))
+                a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, found)
+                if a > b:
+                    continue
+            fresh[m] = placed[k]
+            m += 1
+        if m == 0:
+            continue
+        if target < 0:
+            slots.count[1] -= 1
+            target = slots.lines[slots.count[1]]
+            lines.alive[target] = True
+            lines.first[target] = -1
+        store(lines, target, r0, a0, p0)
+        lay(target, fresh, m, rows, lines, grid, slots, door)
+        # fragments that the wall now covers go
+        row = lines.first[target]
+        while row >= 0:
+            w = rows.segments[row]
+            for q in range(box_query(grid, w, 1.0, found)):
+                f = found[q]
+                if rows.line[f] >= 0:
+                    continue
+                g = rows.segments[f]
+                tolerance = COVER + 3.0 * rows.sigma[f]
+                if segment_distance(g[0], g[1], w) <= tolerance and segment_distance(g[2], g[3], w) <= tolerance:
+                    free_row(rows, grid, slots, f)
+            row = rows.next[row]
+
+    piece = np.empty(4)
+    for k in range(fragments.shape[0]):
+        d2 = 0.0
+        for e in range(2):
+            x, y = fragments[k, 2 * e], fragments[k, 2 * e + 1]
+            piece[2 * e], piece[2 * e + 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
+            d2 = max(d2, x * x + y * y)
+        sigma = math.sqrt(var_range + var_xy + (var_angle + pose_covariance[2, 2]) * d2)
+        a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, found)
+        if a > b:
+            continue
+        row = new_row(rows, slots)
+        rows.line[row], rows.side[row], rows.next[row], rows.sigma[row] = -1, 0, -1, sigma
+        e4 = rows.ends[row]
+        e4[0], e4[1] = piece[0] + a * (piece[2] - piece[0]), piece[1] + a * (piece[3] - piece[1])
+        e4[2], e4[3] = piece[0] + b * (piece[2] - piece[0]), piece[1] + b * (piece[3] - piece[1])
+        rows.end_variance[row] = sigma * sigma
+        publish(rows, grid, slots, row)
