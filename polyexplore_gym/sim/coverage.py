@@ -26,34 +26,34 @@ _DEPTH_TOLERANCE = 1e-9
 
 
 @njit(cache=True, inline="always")
-def _pseudo_angle(y, x):  # type: ignore[no-untyped-def]
-    """Grows with the bearing from 0 to 4 over a turn, without trigonometry."""
-    p = y / (abs(x) + abs(y))
-    if x < 0.0:
-        return 2.0 - p
-    return p if y >= 0.0 else 4.0 + p
+def _bin(y, x):  # type: ignore[no-untyped-def]
+    """Angular bin 0 .. _BINS - 1, growing with the bearing from 0 to 2 pi: no trigonometry, no branches."""
+    share = y / (abs(x) + abs(y) + 1e-300)
+    quarter = (2.0 - share) if x < 0.0 else (share + (4.0 if y < 0.0 else 0.0))
+    return np.uint32(min(quarter * (_BINS / 4.0), _BINS - 0.5))
 
 
 @njit(cache=True)
-def _visible(segments, x, y, dx, dy):  # type: ignore[no-untyped-def]
-    """Which of the points at (dx, dy) (n,) from the sensor at x, y no wall hides: (n,) bool."""
+def _visible(segments, x, y, dx, dy, reach):  # type: ignore[no-untyped-def]
+    """Which of the points at (dx, dy) (n,) from the sensor at x, y no wall hides: (n,) bool.
+
+    All points lie within reach."""
     n = dx.size
-    order, starts, bins = np.empty(n, np.int64), np.zeros(_BINS + 1, np.int64), np.empty(n, np.int64)
-    reach = 0.0
+    starts, bins, place = np.zeros(_BINS + 1, np.uint32), np.empty(n, np.uint32), np.empty(n, np.uint32)
     for i in range(n):
-        reach = max(reach, abs(dx[i]), abs(dy[i]))
-        at = _pseudo_angle(dy[i], dx[i]) if dx[i] != 0.0 or dy[i] != 0.0 else 0.0
-        bins[i] = min(int(at * (_BINS / 4.0)), _BINS - 1)
-        starts[bins[i] + 1] += 1
-    for k in range(_BINS):
-        starts[k + 1] += starts[k]
-    filled = starts[:_BINS].copy()
+        bins[i] = _bin(dy[i], dx[i])
+    for i in range(n):  # counting sort by bin
+        b = bins[i]
+        place[i] = starts[b]
+        starts[b] += np.uint32(1)
+    total = np.uint32(0)
+    for k in range(_BINS + 1):
+        starts[k], total = total, total + starts[k]
     sx, sy, nearest = np.empty(n), np.empty(n), np.zeros(n)
     for i in range(n):
-        j = filled[bins[i]]
-        filled[bins[i]] += 1
-        order[j] = i
-        sx[j], sy[j] = dx[i], dy[i]
+        at = place[i] + starts[bins[i]]
+        place[i] = at
+        sx[at], sy[at] = dx[i], dy[i]
     for k in range(segments.shape[0]):
         ax, ay = segments[k, 0] - x, segments[k, 1] - y
         bx, by = segments[k, 2] - x, segments[k, 3] - y
@@ -66,8 +66,7 @@ def _visible(segments, x, y, dx, dy):  # type: ignore[no-untyped-def]
             continue
         if cross < 0.0:
             ax, ay, bx, by = bx, by, ax, ay
-        low = min(int(_pseudo_angle(ay, ax) * (_BINS / 4.0)), _BINS - 1)
-        high = min(int(_pseudo_angle(by, bx) * (_BINS / 4.0)), _BINS - 1)
+        low, high = _bin(ay, ax), _bin(by, bx)
         i, j = starts[low], starts[high + 1]
         if low <= high:
             strike(sx[i:j], sy[i:j], nearest[i:j], ax, ay, bx, by)
@@ -75,8 +74,8 @@ def _visible(segments, x, y, dx, dy):  # type: ignore[no-untyped-def]
             strike(sx[i:], sy[i:], nearest[i:], ax, ay, bx, by)
             strike(sx[:j], sy[:j], nearest[:j], ax, ay, bx, by)
     out = np.empty(n, np.bool_)
-    for j in range(n):
-        out[order[j]] = nearest[j] <= 1.0 + _DEPTH_TOLERANCE
+    for i in range(n):
+        out[i] = nearest[place[i]] <= 1.0 + _DEPTH_TOLERANCE
     return out
 
 
@@ -133,13 +132,16 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             cell = r * columns + c
+            mx, my = x0 + (c + 0.5) * _CELL - x, y0 + (r + 0.5) * _CELL - y
+            if math.hypot(mx, my) > reach + _CELL or (half_view <= 0.5 * math.pi and mx * hx + my * hy < -_CELL):
+                continue  # the whole cell is out of range, or behind
             for j in range(starts[cell], starts[cell] + unseen[cell]):
                 ux, uy = px[j] - x, py[j] - y
                 d2 = ux * ux + uy * uy
                 if d2 <= reach * reach and ux * hx + uy * hy >= least * math.sqrt(d2):
                     slots[n], dx[n], dy[n] = j, ux, uy
                     n += 1
-    visible = _visible(segments, x, y, dx[:n], dy[:n])
+    visible = _visible(segments, x, y, dx[:n], dy[:n], reach)
     new = 0
     for i in range(n - 1, -1, -1):  # from the back, so that a swap moves no slot still to come
         if not visible[i]:

@@ -49,17 +49,12 @@ def _bearing(y, x):  # type: ignore[no-untyped-def]
 @njit(cache=True, inline="always")
 def out_of_reach(ax, ay, bx, by, reach):  # type: ignore[no-untyped-def]
     """Whether the wall a, b surely lies farther than `reach` from the origin (bounding boxes)."""
-    return (
-        (ax > reach and bx > reach)
-        or (ax < -reach and bx < -reach)
-        or (ay > reach and by > reach)
-        or (ay < -reach and by < -reach)
-    )
+    return (min(ax, bx) > reach) | (max(ax, bx) < -reach) | (min(ay, by) > reach) | (max(ay, by) < -reach)
 
 
 @njit(cache=True)
 def strike(dir_x, dir_y, best, ax, ay, bx, by):  # type: ignore[no-untyped-def]
-    """Raise `best` (n,) to 1/t where the ray t * (dir_x, dir_y) from the origin meets the wall a, b; needs a x b > 0."""
+    """Raise `best` (n,) to 1/t where the ray t (dir_x, dir_y) from the origin meets the wall a, b; needs a x b > 0."""
     ex, ey = bx - ax, by - ay
     inverse = 1.0 / (ax * by - ay * bx)
     mx, my = ex * inverse, ey * inverse
@@ -230,7 +225,7 @@ class Laser:
     def scan(self, segments: np.ndarray, pose: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """As `measure`, with the standard normal noise (2, n) given; zeros give the true ranges."""
         pose = np.ascontiguousarray(pose, dtype=np.float64)
-        if pose.shape != (3,) or not np.isfinite(pose).all():
+        if pose.shape != (3,) or not math.isfinite(pose[0] + pose[1] + pose[2]):
             raise InvalidMotionError(f"sensor pose {pose!r}: expected three finite numbers")
         config = self.config
         return _measure(
