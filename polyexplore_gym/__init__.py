@@ -1,3 +1,11 @@
 """Exploration of unknown polygonal floor plans by a robot with a noisy 2D laser."""
 
+from gymnasium.envs.registration import register
+
 __version__ = "0.1.0"
+
+_ENTRY = "polyexplore_gym.env:PolyExploreEnv"
+register("PolyExplore-Home-v0", _ENTRY, kwargs={"suite": "home-train"})
+register("PolyExplore-Office-v0", _ENTRY, kwargs={"suite": "office-train"})
+register("PolyExplore-Mixed-v0", _ENTRY, kwargs={"suite": "mixed-train"})
+register("PolyExplore-Plan-v0", _ENTRY)

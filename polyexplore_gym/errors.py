@@ -13,6 +13,10 @@ class InvalidConfigError(PolyExploreError, ValueError):
     """A configuration field is unknown or out of range; the message names it."""
 
 
+class InvalidActionError(PolyExploreError, ValueError):
+    """An action is not an integer or lies outside the action space."""
+
+
 class InvalidMotionError(PolyExploreError, ValueError):
     """A pose, path or wall array handed to the simulated world is unusable; the message says which and why."""
 

@@ -158,6 +158,41 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
     return new
 
 
+@njit(cache=True)
+def grid_points(segments, spacing):  # type: ignore[no-untyped-def]
+    """Points (k, 2) of a square grid of `spacing` m in the free area bounded by closed rings of walls (M, 4).
+
+    Even-odd rule along each row of the grid; the grid starts half a spacing from the lowest x and y.
+    """
+    x0 = min(segments[:, 0].min(), segments[:, 2].min())
+    x1 = max(segments[:, 0].max(), segments[:, 2].max())
+    y0 = min(segments[:, 1].min(), segments[:, 3].min())
+    y1 = max(segments[:, 1].max(), segments[:, 3].max())
+    columns = int((x1 - x0) / spacing)
+    rows = int((y1 - y0) / spacing)
+    inside = np.zeros((rows, columns), np.bool_)
+    for k in range(segments.shape[0]):
+        ax, ay, bx, by = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+        low = max(int(math.ceil((min(ay, by) - y0) / spacing - 0.5)), 0)
+        for r in range(low, rows):
+            y = y0 + (r + 0.5) * spacing
+            if y >= max(ay, by):
+                break
+            if y < min(ay, by):
+                continue
+            # Everything to the right of the crossing changes side.
+            x = ax + (y - ay) / (by - ay) * (bx - ax)
+            first = max(int(math.ceil((x - x0) / spacing - 0.5)), 0)
+            for c in range(first, columns):
+                inside[r, c] = not inside[r, c]
+    found = np.argwhere(inside)
+    out = np.empty((found.shape[0], 2))
+    for i in range(found.shape[0]):
+        out[i, 0] = x0 + (found[i, 1] + 0.5) * spacing
+        out[i, 1] = y0 + (found[i, 0] + 0.5) * spacing
+    return out
+
+
 class Coverage:
     """Which sample points of the free area have been seen from the poses added so far."""
 

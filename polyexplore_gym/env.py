@@ -1,0 +1,349 @@
+"""PolyExploreEnv: one decision is one step; choose a node, the robot drives there and measures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from polyexplore_gym import observation
+from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.errors import InvalidActionError, InvalidConfigError
+from polyexplore_gym.exploration import ExplorationMap
+from polyexplore_gym.floorplan import FloorPlan, load_plan
+from polyexplore_gym.mapping import LineMap, extract_lines
+from polyexplore_gym.rewards import StepOutcome, rewards
+from polyexplore_gym.scan import Scan
+from polyexplore_gym.sim.coverage import Coverage, grid_points
+from polyexplore_gym.sim.pose import PoseModel
+from polyexplore_gym.sim.world import World
+from polyexplore_gym.snapshot import Snapshot
+
+COVERAGE_GRID = 0.2
+"""Spacing of the sample points behind `info["coverage"]`, m."""
+
+
+class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
+    """Explore an unknown floor plan with a noisy laser, one frontier node at a time.
+
+    Observation: see `polyexplore_gym.observation`. Action: the index of a node; `action_masks()`, the
+    observation and `info` say which are valid; a masked one does nothing and is penalised, one out
+    of range raises. Reward: minus the metres driven by default (`RewardConfig`). The episode
+    terminates when no reachable jump edge is left and is truncated after `EnvConfig.max_decisions`.
+
+    Version history: v0, the first.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+
+    def __init__(
+        self,
+        plan: FloorPlan | str | Path | None = None,
+        suite: str | None = None,
+        config: EnvConfig | Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """The plan to explore, or the name of a suite from which each episode draws one.
+
+        Args:
+            plan: a floor plan, or the path of one in any known format.
+            suite: such as "home-train"; see `polyexplore_gym.floorplan.list_suites()`.
+            config: an `EnvConfig`, a nested mapping of its fields, or None for the defaults.
+            render_mode: "rgb_array", "human" or None.
+
+        Raises:
+            InvalidConfigError: a field of the configuration is unknown or out of range.
+            InvalidFloorPlanError: the plan cannot be read or is invalid.
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InvalidConfigError(f"render_mode {render_mode!r}: must be None, 'rgb_array' or 'human'")
+        self.config = config if isinstance(config, EnvConfig) else from_mapping(EnvConfig, config or {})
+        self.render_mode = render_mode
+        self._suite = None if suite is None else _suite(suite)
+        self._plan = None if plan is None else self._checked(plan)
+        self.observation_space = observation.space(self.config.observation)
+        self.action_space = spaces.Discrete(self.config.observation.max_nodes)
+        self._world: World | None = None
+        self._window: Any = None
+
+    # Gymnasium ------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: of all randomness: plan, start, laser and pose each get a stream of their own.
+            options: "plan": a `FloorPlan` or a path; "start": (x, y, heading) in metres and radians.
+
+        Raises:
+            InvalidFloorPlanError: the plan or the start is unusable, or none was given.
+        """
+        super().reset(seed=seed)
+        plan_rng, start_rng, self._laser_rng, pose_rng = self.np_random.spawn(4)
+        options = dict(options or {})
+        given, start = options.pop("plan", None), options.pop("start", None)
+        if options:
+            raise InvalidConfigError(f"reset: unknown option {min(options)!r}; known: plan, start")
+        c = self.config
+        plan = self._plan
+        if given is not None:
+            plan = self._checked(given)
+        elif self._suite is not None:
+            plan = self._suite.plan(int(plan_rng.integers(len(self._suite))))
+        if plan is None:
+            raise InvalidConfigError("no floor plan: give plan= to the environment or options={'plan': ...} to reset")
+        if start is None:
+            pose = plan.sample_start(start_rng, c.robot.radius)
+        else:
+            plan.check_start(start, c.robot.radius)
+            pose = np.array([*start, 0.0][:3], dtype=np.float64)
+        self.plan = plan
+        self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
+        self._pose_model = PoseModel(c.pose, pose, pose_rng)
+        self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
+        self._lines = LineMap(c.mapping, c.sensor)
+        self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
+        self._decisions = self._measurements = self._collisions = 0
+        self._distance = self._sim_time = 0.0
+        self._path = pose[None, :2].copy()
+        self._trajectory = [pose[None]]
+        self._measured_at: list[np.ndarray] = []
+        self._chosen: int | None = None
+        self._over = False
+        self._look_around()
+        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
+        self._observe()
+        info = self._info(StepOutcome(), invalid=False)
+        if self.render_mode == "human":
+            self.render()
+        return self._observed.arrays, info
+
+    def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Drive to node `action`, measure there, and observe.
+
+        Raises:
+            InvalidActionError: not an integer, or outside the action space.
+        """
+        if self._world is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        node = self._checked_action(action)
+        self._decisions += 1
+        before = (self._distance, self._coverage.share, self._measurements, self._collisions)
+        valid = bool(self._observed.arrays["action_mask"][node])
+        if valid:
+            self._go(int(self._observed.rows[node]))
+            self._observe()
+        self._chosen = node if valid else None
+        terminated = not self._observed.arrays["action_mask"].any()
+        outcome = StepOutcome(
+            distance=self._distance - before[0],
+            coverage=self._coverage.share - before[1],
+            measurement=self._measurements - before[2],
+            collision=self._collisions - before[3],
+            completion=float(terminated),
+            invalid_action=float(not valid),
+        )
+        info = self._info(outcome, invalid=not valid)
+        reward = float(sum(info["rewards"].values()))
+        truncated = not terminated and self._decisions >= self.config.max_decisions
+        if self.render_mode == "human":
+            self.render()
+        return self._observed.arrays, reward, terminated, truncated, info
+
+    def action_masks(self) -> np.ndarray:
+        """(max_nodes,) bool: which actions are valid (the name that sb3-contrib's MaskablePPO looks for)."""
+        return self._observed.arrays["action_mask"].astype(bool)
+
+    def render(self) -> np.ndarray | None:
+        """A picture (h, w, 3) uint8 in `rgb_array` mode; shows it in a window in `human` mode."""
+        from polyexplore_gym import rendering
+
+        if self.render_mode is None or self._world is None:
+            gymnasium.logger.warn("render() needs a render_mode and a reset()")
+            return None
+        picture = rendering.frame(self.snapshot())
+        if self.render_mode == "rgb_array":
+            return picture
+        if self._window is None:
+            self._window = rendering.Window(f"polyexplore_gym: {self.plan.name}", self.metadata["render_fps"])
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    # What happens in a step -------------------------------------------------------------------
+
+    def _look_around(self) -> None:
+        """Measure at the start; all round, by turning on the spot, if so configured."""
+        assert self._world is not None
+        fov = self.config.sensor.field_of_view
+        turns = math.ceil(2.0 * math.pi / fov - 1e-9) if self.config.exploration.look_around else 1
+        heading = self._world.pose[2]
+        for i in range(turns):
+            if i:
+                self._drive(self._world.pose[None, :2], heading + i * 2.0 * math.pi / turns)
+            self._measure(self._world.pose, None, arrived=True)
+
+    def _go(self, row: int) -> None:
+        """Drive to a node, measure there (and on the way, if so configured), and plan anew."""
+        exploration = self._exploration
+        target = int(exploration.chains.id[row])
+        heading = float(exploration.chains.node[row, 2])
+        self._path = exploration.path_to(row)
+        true_path = self._pose_model.to_true(self._path)
+        turn = self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2]
+        assert self._world is not None
+        true_path[0] = self._world.pose[:2]
+        arrived = self._drive(true_path, turn)
+        self._measure(self._world.pose, target, arrived=arrived)
+        exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
+
+    def _drive(self, path: np.ndarray, heading: float) -> bool:
+        """Drive; scans on the way are taken without stopping. Whether the end was reached."""
+        assert self._world is not None
+        result = self._world.drive(path, heading)
+        way = result.trajectory
+        every = self.config.exploration.scan_every
+        done = 0
+        if every > 0:
+            driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))))
+            for mark in np.arange(every, driven[-1] - 0.5 * every, every):
+                stop = int(np.searchsorted(driven, mark))
+                self._pose_model.moved(way[done : stop + 1])
+                self._measure(way[stop], None, arrived=True)
+                done = stop
+        self._pose_model.moved(way[done:])
+        self._trajectory.append(way)
+        self._distance += result.distance
+        self._sim_time += result.duration
+        self._collisions += int(result.collided)
+        return result.arrived
+
+    def _measure(self, pose: np.ndarray, target: int | None, *, arrived: bool) -> None:
+        """Scan from a true pose and take the scan into both maps."""
+        assert self._world is not None
+        laser = self._world.laser
+        ranges = laser.measure(self._world.segments, pose, self._laser_rng)
+        estimate, covariance = self._pose_model.measured(pose)
+        scan = Scan(laser.angles, ranges, estimate, covariance, self.config.sensor.full_circle)
+        found = extract_lines(scan.angles, scan.ranges, self.config.sensor, self.config.mapping)
+        touched = self._lines.insert(found, estimate, covariance)
+        self._exploration.insert(
+            scan,
+            self._lines.segments,
+            self._lines.alive,
+            touched,
+            point_segment=found.point_segment,
+            ranges=found.smoothed,
+            target=target,
+            arrived=arrived,
+        )
+        self._coverage.add(self._world.segments, pose, self.config.sensor)
+        self._measurements += 1
+        self._scan = scan
+        self._measured_at.append(pose)
+
+    def _observe(self) -> None:
+        self._observed = observation.observe(
+            self._exploration,
+            self._lines,
+            self._pose_model.estimate,
+            self._pose_model.covariance,
+            self.config.sensor.max_range,
+            self.config.observation,
+        )
+
+    def _info(self, outcome: StepOutcome, *, invalid: bool) -> dict[str, Any]:
+        return {
+            "action_mask": self._observed.arrays["action_mask"].copy(),
+            "distance": self._distance,
+            "coverage": self._coverage.share,
+            "measurements": self._measurements,
+            "sim_time": self._sim_time,
+            "collisions": self._collisions,
+            "path": self._path,
+            "rewards": rewards(outcome, self.config.reward),
+            "invalid_action": invalid,
+            "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
+        }
+
+    def _checked_action(self, action: Any) -> int:
+        if isinstance(action, np.ndarray) and action.ndim == 0:
+            action = action[()]
+        if isinstance(action, (bool, np.bool_)) or not isinstance(action, (int, np.integer)):
+            raise InvalidActionError(f"action {action!r}: expected an integer, the index of a node")
+        if not 0 <= action < self.action_space.n:  # type: ignore[attr-defined]
+            raise InvalidActionError(f"action {action}: must lie in 0 to {self.action_space.n - 1}")  # type: ignore[attr-defined]
+        return int(action)
+
+    def _checked(self, plan: FloorPlan | str | Path) -> FloorPlan:
+        plan = plan if isinstance(plan, FloorPlan) else load_plan(plan)
+        plan.check_connected(self.config.robot.radius)
+        return plan
+
+    # For whoever looks on ---------------------------------------------------------------------
+
+    @property
+    def exploration(self) -> ExplorationMap:
+        """The exploration map of this episode."""
+        return self._exploration
+
+    @property
+    def line_map(self) -> LineMap:
+        """The line map of this episode."""
+        return self._lines
+
+    @property
+    def true_pose(self) -> np.ndarray:
+        """(3,) where the robot really is: for scores and pictures, not for policies."""
+        assert self._world is not None
+        return self._world.pose
+
+    def snapshot(self) -> Snapshot:
+        """This moment as plain arrays, for `polyexplore_gym.rendering`."""
+        from polyexplore_gym.exploration import shapes
+
+        e, lines = self._exploration, self._lines
+        rows = self._observed.rows
+        alive = np.flatnonzero(lines.alive)
+        return Snapshot(
+            exterior=self.plan.exterior,
+            holes=self.plan.holes,
+            walls=lines.segments[alive].copy(),
+            wall_fitted=lines.line[alive] >= 0,
+            explored=shapes.rings(shapes.exploration_polygon(e)),
+            jump_edges=shapes.jump_edges(e),
+            node_positions=e.chains.node[rows, :2].copy(),
+            node_headings=e.chains.node[rows, 2].copy(),
+            node_mask=np.isfinite(e.chains.path_length[rows]),
+            chosen=None,
+            trajectory=np.concatenate(self._trajectory),
+            measured_at=np.array(self._measured_at),
+            path=self._path,
+            scan=shapes.scan_points(self._scan, self.config.sensor.max_range),
+            scan_pose=self._scan.pose.copy(),
+            pose=self.true_pose,
+            estimate=self._pose_model.estimate,
+            radius=self.config.robot.radius,
+            distance=self._distance,
+            coverage=self._coverage.share,
+            measurements=self._measurements,
+            title=self.plan.name,
+        )
+
+
+def _suite(name: str) -> Any:
+    from polyexplore_gym.floorplan import suite
+
+    return suite(name)

@@ -1,0 +1,401 @@
+"""The exploration map: what has been seen, where it is open, and how to get there.
+
+Sees scans, pose estimates and fitted walls; never the floor plan.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.config import ExplorationConfig, SensorConfig
+from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
+from polyexplore_gym.exploration.path_graph import PathGraph
+from polyexplore_gym.scan import Scan
+
+_PIECE = 2.0
+"""Open edges are cut into pieces of at most this length, m."""
+_SLACK = 0.3
+"""Paths may cross an open edge this near (m) to the node or robot at their end."""
+_SPARE = 0.05
+"""Paths round corners keep this much more than the robot's radius, m."""
+
+
+@njit(cache=True)
+def _near(segments, alive, x, y, reach):
+    """Living segments whose bounding box comes within `reach` of a point (in the maximum norm)."""
+    n = segments.shape[0]
+    rows = np.empty(n, np.int64)
+    count = 0
+    for i in range(n):
+        if (
+            alive[i]
+            and min(segments[i, 0], segments[i, 2]) <= x + reach
+            and max(segments[i, 0], segments[i, 2]) >= x - reach
+            and min(segments[i, 1], segments[i, 3]) <= y + reach
+            and max(segments[i, 1], segments[i, 3]) >= y - reach
+        ):
+            rows[count] = i
+            count += 1
+    return rows[:count].copy()
+
+
+@dataclass(slots=True)
+class Chains:
+    """The jump edges, one row each; `node` and what follows describe the node in front of it."""
+
+    id: np.ndarray
+    """(c,) identity: kept as long as the jump edge does not change."""
+    length: np.ndarray
+    """(c,) l_n, m."""
+    middle: np.ndarray
+    """(c, 2) point at half the length."""
+    normal: np.ndarray
+    """(c, 2) unit vector into the unknown."""
+    ends: np.ndarray
+    """(c, 4) its end points."""
+    kind: np.ndarray
+    """(c,) `scan_polygon` label of most of it."""
+    visits: np.ndarray
+    """(c,) measurements made or attempted for it in vain."""
+    node: np.ndarray
+    """(c, 3) position and heading of the node."""
+    vertex: np.ndarray
+    """(c,) vertex in the path graph, -1 where the robot can stand nowhere for it."""
+    gain: np.ndarray
+    """(c,) g_n, rad."""
+    path_length: np.ndarray
+    """(c,) c_n from the robot, m; inf where there is no path."""
+
+    @classmethod
+    def none(cls) -> Chains:
+        """An empty table."""
+        z = np.zeros(0)
+        i = np.zeros(0, np.int64)
+        return cls(i, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i,
+                   np.zeros((0, 3)), i, z, z)  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def take(self, rows: np.ndarray) -> Chains:
+        """The table of some rows."""
+        return Chains(*(getattr(self, name)[rows] for name in self.__slots__))
+
+    def join(self, other: Chains) -> Chains:
+        """Both tables, one below the other."""
+        return Chains(*(np.concatenate((getattr(self, n), getattr(other, n))) for n in self.__slots__))
+
+
+class ExplorationMap:
+    """Owner of the exploration's state: scan polygons, open edges, jump edges, nodes and paths.
+
+    `insert` takes a scan, `plan` then brings nodes and paths up to date for a robot at a pose.
+    """
+
+    def __init__(self, config: ExplorationConfig, sensor: SensorConfig, radius: float) -> None:
+        """`radius` of the robot's disc, m."""
+        self.config = config
+        self.sensor = sensor
+        self.min_gap = 2.0 * radius if config.min_gap is None else config.min_gap
+        noise = math.hypot(sensor.sigma_range, 0.5 * sensor.sigma_angle * sensor.max_range)
+        self.nudge = 0.03 + 2.0 * noise
+        self.cover = 0.04 + 3.0 * sensor.sigma_range
+        self.join = 0.05 + 2.0 * noise
+        self.full = sensor.full_circle
+        n = sensor.beams
+        self.n_scans = 0
+        self.apexes = np.zeros((16, 2))
+        self.headings = np.zeros(16)
+        self.points = np.zeros((16, n, 2))
+        self.rays = np.zeros((16, n, 2))
+        self.labels: list[np.ndarray] = []
+        self.angles = np.zeros(n)
+        self.pieces = np.zeros((0, 4))
+        self.kinds = np.zeros(0, np.int8)
+        self.visits = np.zeros(0, np.int64)
+        self.done = np.zeros(0, np.bool_)
+        self.owner = np.zeros(0, np.int64)
+        self.chains = Chains.none()
+        self.graph = PathGraph(radius, _SPARE, 0.01)
+        self.robot = -1
+        self._next_id = 0
+        self._touched: list[np.ndarray] = []
+        self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
+
+    # Scans -----------------------------------------------------------------------------------
+
+    def insert(
+        self,
+        scan: Scan,
+        walls: np.ndarray,
+        alive: np.ndarray,
+        touched: np.ndarray,
+        *,
+        point_segment: np.ndarray | None = None,
+        ranges: np.ndarray | None = None,
+        target: int | None = None,
+        arrived: bool = True,
+    ) -> None:
+        """Take in a scan.
+
+        `walls` (m, 4) with `alive` (m,) are the rows of the line map and `touched` those that this scan
+        changed; `point_segment` (n,) names the fitted segment of each return and `ranges` (n,) the
+        smoothed ranges. `target` is the id of the jump edge that the robot set out to measure.
+        """
+        ranges = scan.ranges if ranges is None else ranges
+        if point_segment is None:
+            point_segment = np.full(len(scan.angles), -1, np.int64)
+        s = self._store(scan, ranges)
+        x, y = float(scan.pose[0]), float(scan.pose[1])
+        reach = self.sensor.max_range + 0.1
+        self._touched.append(touched)
+        self._box = np.array([
+            min(self._box[0], x - reach), min(self._box[1], y - reach),
+            max(self._box[2], x + reach), max(self._box[3], y + reach),
+        ])  # fmt: skip
+        near_walls = walls[_near(walls, alive, x, y, reach)]
+        labels = scan_polygon.label_edges(
+            scan.angles, ranges, point_segment, self.sensor.max_range, self.sensor.sigma_range,
+            self.sensor.sigma_angle, self.min_gap, self.full,
+        )  # fmt: skip
+        self.labels.append(labels)
+        fresh, fresh_kinds = scan_polygon.open_edges(self.points[s], labels, self.sensor.max_range, _PIECE, self.full)
+        fresh += np.array([x, y, x, y])
+        fresh, origin, _ = self._clip(fresh, 0, s, near_walls)
+        fresh_kinds = fresh_kinds[origin]
+
+        local = _near(self.pieces, np.ones(len(self.pieces), np.bool_), x, y, reach)
+        kept, origin, changed = self._clip(self.pieces[local], s, s + 1, near_walls)
+        dirty = np.zeros(len(self.pieces), np.bool_)
+        dirty[local[changed]] = True
+        if target is not None:
+            mine = self.owner == target
+            self.visits[mine] += 1
+            dirty |= mine
+        self._rechain(local, kept, origin, dirty, fresh, fresh_kinds, s, target if arrived else None)
+
+    def _store(self, scan: Scan, ranges: np.ndarray) -> int:
+        s = self.n_scans
+        if s == len(self.headings):
+            self.apexes = np.concatenate((self.apexes, np.zeros_like(self.apexes)))
+            self.headings = np.concatenate((self.headings, np.zeros_like(self.headings)))
+            self.points = np.concatenate((self.points, np.zeros_like(self.points)))
+            self.rays = np.concatenate((self.rays, np.zeros_like(self.rays)))
+        self.apexes[s] = scan.pose[:2]
+        self.headings[s] = scan.pose[2]
+        self.angles = scan.angles
+        self.points[s], self.rays[s] = scan_polygon.corner_points(
+            scan.angles, ranges, float(scan.pose[2]), self.sensor.max_range
+        )
+        self.n_scans += 1
+        return s
+
+    def _clip(
+        self, pieces: np.ndarray, first: int, last: int, walls: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return jump_edges.clip(
+            pieces, self.apexes, self.headings, self.points, self.rays, first, last, self.angles, self.full,
+            self.sensor.max_range + 0.2, self.nudge, walls, self.cover, 0.02,
+        )  # fmt: skip
+
+    def _rechain(
+        self,
+        local: np.ndarray,
+        kept: np.ndarray,
+        origin: np.ndarray,
+        dirty: np.ndarray,
+        fresh: np.ndarray,
+        fresh_kinds: np.ndarray,
+        scan: int,
+        measured: int | None,
+    ) -> None:
+        """Replace the local pieces by what is left of them, add the fresh ones, and chain what changed anew."""
+        source = local[origin]
+        away = np.ones(len(self.pieces), np.bool_)
+        away[local] = False
+        rest = np.flatnonzero(away)
+        old = np.concatenate((rest, source))
+        n_fresh = len(fresh)
+        lost_chains = np.unique(self.owner[dirty])
+        lost_chains = lost_chains[lost_chains >= 0]
+        pieces = np.concatenate((self.pieces[rest], kept, fresh))
+        kinds = np.concatenate((self.kinds[old], fresh_kinds))
+        visits = np.concatenate((self.visits[old], np.zeros(n_fresh, np.int64)))
+        done = np.concatenate((self.done[old], np.zeros(n_fresh, np.bool_)))
+        owner = np.concatenate((self.owner[old], np.full(n_fresh, -1, np.int64)))
+        stale = np.concatenate((dirty[old], np.ones(n_fresh, np.bool_)))
+        if len(lost_chains):
+            stale |= np.isin(owner, lost_chains)
+        if measured is not None:
+            for i in np.flatnonzero(owner == measured):
+                if self._looked_at(pieces[i], scan):
+                    done[i] = True
+        done |= visits >= self.config.max_visits
+        stale &= ~done
+        owner[done] = -1
+        # A changed piece may now touch a chain that did not change.
+        while True:
+            hit = jump_edges.touching_chains(pieces, np.where(done, -1, owner), stale, self.join)
+            more = np.unique(owner[hit])
+            if not len(more):
+                break
+            lost_chains = np.union1d(lost_chains, more)
+            stale |= np.isin(owner, more)
+        rows = np.flatnonzero(stale)
+        order, offsets = jump_edges.link(pieces[rows], self.join, self.min_gap, self.sensor.max_range)
+        data, ends, kind, visit = jump_edges.summarise(pieces[rows], kinds[rows], visits[rows], order, offsets)
+        c = len(kind)
+        ids = np.arange(self._next_id, self._next_id + c)
+        self._next_id += c
+        owner[rows[order]] = np.repeat(ids, np.diff(offsets))
+        # Keep the pieces of each chain together and in order: nodes are placed along them.
+        arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
+        self.pieces, self.kinds, self.visits = pieces[arranged], kinds[arranged], visits[arranged]
+        self.done, self.owner = done[arranged], owner[arranged]
+        long_enough = data[:, 0] >= self.min_gap
+        m = int(long_enough.sum())
+        added = Chains(
+            ids[long_enough], data[long_enough, 0], data[long_enough, 1:3], data[long_enough, 3:5],
+            ends[long_enough], kind[long_enough], visit[long_enough], np.zeros((m, 3)),
+            np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
+        )  # fmt: skip
+        gone = np.isin(self.chains.id, lost_chains)
+        # A chain may also have vanished without a piece left.
+        gone |= ~np.isin(self.chains.id, self.owner)
+        for v in self.chains.vertex[gone]:
+            if v >= 0:
+                self._drop_vertex(int(v))
+        self.chains = self.chains.take(np.flatnonzero(~gone)).join(added)
+
+    def _looked_at(self, piece: np.ndarray, scan: int) -> bool:
+        """Whether the known side of a piece lies in a scan polygon: then the scan looked at it and found no more."""
+        dx, dy = piece[2] - piece[0], piece[3] - piece[1]
+        size = max(math.hypot(dx, dy), 1e-9)
+        x = 0.5 * (piece[0] + piece[2]) - self.nudge * dy / size - self.apexes[scan, 0]
+        y = 0.5 * (piece[1] + piece[3]) + self.nudge * dx / size - self.apexes[scan, 1]
+        return bool(
+            scan_polygon.contains(x, y, self.points[scan], self.angles, float(self.headings[scan]), self.full)
+        )
+
+    def _drop_vertex(self, v: int) -> None:
+        g = self.graph
+        row = np.flatnonzero(g.sources == v)
+        g.remove_leaf(v)
+        if len(row):
+            keep = np.flatnonzero(g.sources != v)
+            g.sources, g.dist, g.parent = g.sources[keep], g.dist[keep], g.parent[keep]
+
+    # Nodes and paths -------------------------------------------------------------------------
+
+    def plan(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> None:
+        """Bring nodes, gains and shortest paths up to date for a robot at the estimated `pose` (3,)."""
+        g = self.graph
+        c = self.chains
+        if self._touched:
+            touched = np.unique(np.concatenate(self._touched))
+            g.set_walls(walls, alive, touched)
+            g.set_pieces(self.pieces, self.owner)
+            g.refresh(self._box, _SLACK)
+        if self.robot >= 0:
+            g.remove_leaf(self.robot)
+        self.robot = g.add_leaf(float(pose[0]), float(pose[1]), -2, _SLACK)
+        reach = self.sensor.max_range
+        x0, y0, x1, y1 = self._box
+        local = (
+            (c.middle[:, 0] >= x0 - reach) & (c.middle[:, 0] <= x1 + reach)
+            & (c.middle[:, 1] >= y0 - reach) & (c.middle[:, 1] <= y1 + reach)
+        )  # fmt: skip
+        for i in np.flatnonzero(local):
+            v = int(c.vertex[i])
+            if v >= 0 and g.clearance(c.node[i, 0], c.node[i, 1]) < g.need - 0.02:
+                self._drop_vertex(v)
+                c.vertex[i] = v = -1
+            if v < 0:
+                self._place(int(i))
+        self._update_sources()
+        lost = np.flatnonzero(local & ~np.isfinite(c.path_length))
+        if len(lost):
+            seen = g.reachable(self.robot)
+            for i in lost:
+                self._place_within(int(i), seen)
+            self._update_sources()
+        which = np.flatnonzero(local)
+        nodes.gains(
+            which, c.node, c.vertex >= 0, c.middle, c.ends, c.id, np.ones(len(c), np.bool_), self.sensor.max_range,
+            g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, c.gain,
+        )  # fmt: skip
+        g.compact()
+        self._touched = []
+        self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
+
+    def _update_sources(self) -> None:
+        g, c = self.graph, self.chains
+        rows = np.flatnonzero(c.vertex >= 0)
+        vertices = c.vertex[rows]
+        if not np.array_equal(vertices, g.sources):
+            row_of = {int(v): k for k, v in enumerate(g.sources)}
+            g.set_sources(vertices, np.array([row_of.get(int(v), -1) for v in vertices], np.int64))
+        g.repair()
+        c.path_length[:] = math.inf
+        c.path_length[rows] = g.dist[:, self.robot]
+
+    def _rows(self, chain: int) -> np.ndarray:
+        return np.flatnonzero(self.owner == chain)
+
+    def _place(self, i: int) -> None:
+        """Put the node of a jump edge at its configured place, if the disc can stand there."""
+        g, c, config = self.graph, self.chains, self.config
+        (mx, my), (nx, ny) = c.middle[i], c.normal[i]
+        x, y = mx, my
+        if config.placement == "in_front":
+            sampled = c.length[i] / (config.samples * self.sensor.resolution)
+            d = min(config.front_distance, sampled)
+            x, y = mx - d * nx, my - d * ny
+        if nodes.stands(
+            x, y, mx, my, c.id[i], g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need
+        ):
+            self._set_node(i, x, y, math.atan2(ny, nx))
+
+    def _place_within(self, i: int, seen: np.ndarray) -> None:
+        """Put the node at the reachable place nearest to its jump edge that sees it, or mask it."""
+        g, c = self.graph, self.chains
+        v = int(c.vertex[i])
+        x, y, heading, found = nodes.nearest_reachable(
+            self._rows(int(c.id[i])), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
+            self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
+        )  # fmt: skip
+        if found:
+            if v >= 0:
+                self._drop_vertex(v)
+            self._set_node(i, x, y, heading)
+
+    def _set_node(self, i: int, x: float, y: float, heading: float) -> None:
+        c = self.chains
+        c.node[i] = x, y, heading
+        c.vertex[i] = self.graph.add_leaf(float(x), float(y), int(c.id[i]), _SLACK)
+
+    @property
+    def reachable(self) -> np.ndarray:
+        """Which nodes (c,) the robot can go to."""
+        return np.isfinite(self.chains.path_length)
+
+    def path_to(self, i: int) -> np.ndarray:
+        """Way points (k, 2) of the shortest path from the robot to node i."""
+        row = int(np.flatnonzero(self.graph.sources == self.chains.vertex[i])[0])
+        return self.graph.path(row, self.robot)
+
+    def path_lengths(self, rows: np.ndarray) -> np.ndarray:
+        """Path lengths (k, k) between the nodes `rows`, m; inf where there is no path."""
+        g, c = self.graph, self.chains
+        result = np.full((len(rows), len(rows)), math.inf)
+        with_vertex = np.flatnonzero(c.vertex[rows] >= 0)
+        if len(with_vertex):
+            vertices = c.vertex[rows[with_vertex]]
+            order = np.argsort(g.sources)
+            k = order[np.searchsorted(g.sources[order], vertices)]
+            result[np.ix_(with_vertex, with_vertex)] = g.dist[np.ix_(k, vertices)]
+        return result

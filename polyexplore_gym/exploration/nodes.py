@@ -1,0 +1,147 @@
+"""Frontier nodes: where to stand for a jump edge, and how much of all jump edges is seen from there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.exploration.path_graph import REACH
+from polyexplore_gym.exploration.segments import clearance, crossing_free, sweep_free
+
+_FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
+_OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0])
+_SIGHT = 0.05
+"""A line of sight may end within this distance (m) of its target's own walls."""
+
+
+@njit(cache=True)
+def sees(ax, ay, bx, by, walls, w_start, w_items, pieces, p_start, p_items, owner, own_a, own_b):
+    """Whether b is in sight of a: no wall between them, and no unknown but the jump edges that own them."""
+    none = np.full(walls.shape[0], -1, np.int64)
+    return _sees(ax, ay, bx, by, walls, w_start, w_items, none, pieces, p_start, p_items, owner, own_a, own_b)
+
+
+@njit(cache=True)
+def _sees(ax, ay, bx, by, walls, w_start, w_items, no_owner, pieces, p_start, p_items, owner, own_a, own_b):
+    if not crossing_free(ax, ay, bx, by, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT):
+        return False
+    return crossing_free(ax, ay, bx, by, pieces, p_start, p_items, owner, own_a, own_b, _SIGHT, _SIGHT)
+
+
+@njit(cache=True)
+def point_along(rows, pieces, fraction):
+    """Point at a fraction of the length of a chain of pieces (rows in order)."""
+    total = 0.0
+    for i in rows:
+        total += math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+    run = fraction * total
+    for i in rows:
+        size = math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+        if run <= size and size > 0.0:
+            f = run / size
+            return pieces[i, 0] + f * (pieces[i, 2] - pieces[i, 0]), pieces[i, 1] + f * (pieces[i, 3] - pieces[i, 1])
+        run -= size
+    i = rows[-1]
+    return pieces[i, 2], pieces[i, 3]
+
+
+@njit(cache=True)
+def stands(x, y, mx, my, chain, walls, w_start, w_items, pieces, p_start, p_items, owner, need):
+    """Whether the disc may stand at (x, y) and the point (mx, my) of its jump edge is in sight."""
+    if clearance(x, y, walls, w_start, w_items, REACH) < need:
+        return False
+    if math.hypot(mx - x, my - y) < _SIGHT:
+        return True
+    return sees(x, y, mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain, chain)
+
+
+@njit(cache=True)
+def _joins(x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p_start, p_items, owner, need, slack):
+    """Whether the disc can go straight from (x, y) to a vertex in `seen`."""
+    for v in range(seen.size):
+        if not seen[v] or kind[v] < 0:
+            continue
+        vx = position[v, 0]
+        vy = position[v, 1]
+        if abs(vx - x) > 8.0 or abs(vy - y) > 8.0:
+            continue
+        if crossing_free(x, y, vx, vy, pieces, p_start, p_items, owner, chain, chain, slack, slack) and sweep_free(
+            x, y, vx, vy, walls, w_start, w_items, need
+        ):
+            return True
+    return False
+
+
+@njit(cache=True)
+def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_range, walls, w_start, w_items,
+                      pieces, p_start, p_items, owner, need, slack):  # fmt: skip
+    """The reachable place nearest to a jump edge from which it is visible: (x, y, heading, found).
+
+    Tries places before the edge on its known side, then the vertices of the graph in `seen`. The
+    heading looks at the edge.
+    """
+    for offset in _OFFSETS:
+        for fraction in _FRACTIONS:
+            px, py = point_along(rows, pieces, fraction)
+            x = px - offset * nx
+            y = py - offset * ny
+            if stands(
+                x, y, px, py, chain, walls, w_start, w_items, pieces, p_start, p_items, owner, need
+            ) and _joins(
+                x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p_start, p_items, owner, need,
+                slack,
+            ):  # fmt: skip
+                return x, y, math.atan2(ny, nx), True
+    best = 0.8 * max_range
+    bx = 0.0
+    by = 0.0
+    found = False
+    for v in range(seen.size):
+        if not seen[v] or kind[v] < 0:
+            continue
+        d = math.hypot(mx - position[v, 0], my - position[v, 1])
+        # Only from the known side is the edge a window into the unknown.
+        if d < best and (mx - position[v, 0]) * nx + (my - position[v, 1]) * ny > 0.1 * d and sees(
+            position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain,
+            chain,
+        ):  # fmt: skip
+            best = d
+            bx = position[v, 0]
+            by = position[v, 1]
+            found = True
+    return bx, by, math.atan2(my - by, mx - bx), found
+
+
+@njit(cache=True)
+def gains(which, node, valid, middle, ends, chain, active, max_range, walls, w_start, w_items, pieces, p_start,
+          p_items, owner, out):  # fmt: skip
+    """g_n (Ekman): the sum of the angles that the jump edges subtend at node n where visible; pi for its own.
+
+    Fills `out` for the chains in `which`; jump edges farther than `max_range` are not seen.
+    """
+    no_owner = np.full(walls.shape[0], -1, np.int64)
+    for n in which:
+        total = math.pi
+        x = node[n, 0]
+        y = node[n, 1]
+        if not valid[n]:
+            out[n] = 0.0
+            continue
+        for i in range(middle.shape[0]):
+            if i == n or not active[i]:
+                continue
+            if math.hypot(middle[i, 0] - x, middle[i, 1] - y) > max_range:
+                continue
+            if not _sees(
+                x, y, middle[i, 0], middle[i, 1], walls, w_start, w_items, no_owner, pieces, p_start, p_items, owner,
+                chain[n], chain[i],
+            ):  # fmt: skip
+                continue
+            ax = ends[i, 0] - x
+            ay = ends[i, 1] - y
+            bx = ends[i, 2] - x
+            by = ends[i, 3] - y
+            total += abs(math.atan2(ax * by - ay * bx, ax * bx + ay * by))
+        out[n] = total

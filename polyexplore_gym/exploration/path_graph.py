@@ -1,0 +1,707 @@
+"""The exploration graph: shortest collision-free paths for the robot's disc through known space.
+
+A visibility graph over the inflated wall ends, kept between decisions. Walls block an edge for
+good, open edges (the boundary to the unknown) only as long as they are there. Nodes and the robot
+are leaves: paths end at them, none leads through. Every source (node) keeps a field of distances
+that is repaired where the graph changed, instead of being searched anew (Ramalingam and Reps 1996).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.exploration.segments import (
+    build_grid,
+    clearance,
+    crossing_free,
+    point_segment_distance,
+    segment_distance,
+    sweep_free,
+)
+
+DEAD, OPEN, BLOCKED = 0, 1, 2
+CORNER, LEAF = 0, 1
+
+REACH = 0.8
+"""Margin (m) of the wall grid: no clearance beyond it is ever asked for."""
+_NEIGHBOURHOOD = 0.25
+"""Radius (m) of the circle around a wall end on which its corner is judged: raggedness below it is no corner."""
+_SPACING = 0.1
+"""Two vertices nearer than this (m) are one."""
+_MAX_EDGE = 20.0
+"""Longest edge of the graph, m."""
+_FLAT = 0.2
+"""A corner that turns less than this (rad) beyond straight gets no vertex."""
+_ARC = math.pi / 4
+"""A path turns round a corner in steps of at most this angle, rad."""
+
+
+@njit(cache=True)
+def _free_sector(ex, ey, walls, start, items):
+    """The widest free sector around a wall end: the directions (from, to) of the walls that bound it.
+
+    Walls are judged where they cross a small circle; returns (a, b, width) with b = a + width, and
+    width 2 pi if nothing crosses it.
+    """
+    mask = start.size - 2
+    h = _NEIGHBOURHOOD
+    angles = np.empty(64)
+    n = 0
+    cell = (int(math.floor(ex)) * 73856093) ^ (int(math.floor(ey)) * 19349663)
+    b = cell & mask
+    for e in range(start[b], start[b + 1]):
+        i = items[e]
+        x1 = walls[i, 0] - ex
+        y1 = walls[i, 1] - ey
+        x2 = walls[i, 2] - ex
+        y2 = walls[i, 3] - ey
+        dx = x2 - x1
+        dy = y2 - y1
+        qa = dx * dx + dy * dy
+        if qa == 0.0:
+            continue
+        qb = x1 * dx + y1 * dy
+        qc = x1 * x1 + y1 * y1 - h * h
+        disc = qb * qb - qa * qc
+        if disc <= 0.0:
+            continue
+        root = math.sqrt(disc)
+        for sign in (-1.0, 1.0):
+            t = (-qb + sign * root) / qa
+            if 0.0 <= t <= 1.0 and n < 64:
+                angles[n] = math.atan2(y1 + t * dy, x1 + t * dx)
+                n += 1
+    if n == 0:
+        return 0.0, 2.0 * math.pi, 2.0 * math.pi
+    found = np.sort(angles[:n])
+    best = found[0] + 2.0 * math.pi - found[n - 1]
+    a = found[n - 1]
+    for i in range(n - 1):
+        gap = found[i + 1] - found[i]
+        if gap > best:
+            best = gap
+            a = found[i]
+    return a, a + best, best
+
+
+@njit(cache=True)
+def corner_vertices(ends, walls, start, items, rho, need):
+    """Vertices around wall ends (m, 2): (v, 2) positions and (v, 7) anchor and bounding wall directions.
+
+    They stand at `rho` from the end on a polyline around it, nearer where the passage is narrow but
+    never nearer than `need` to any wall. Column 6 is 1 where the directions prune, 0 where not.
+    """
+    out = np.empty((16 * ends.shape[0], 2))
+    shape = np.empty((out.shape[0], 7))
+    count = 0
+    for q in range(ends.shape[0]):
+        ex = ends[q, 0]
+        ey = ends[q, 1]
+        a, b, gap = _free_sector(ex, ey, walls, start, items)
+        lone = gap >= 2.0 * math.pi
+        turn = gap if lone else gap - math.pi
+        if turn < _FLAT:
+            continue
+        parts = int(math.ceil(turn / _ARC - 1e-9))
+        first = a if lone else a + 0.5 * math.pi
+        for p in range(parts):
+            direction = first + (p + 0.5) * turn / parts
+            ux = math.cos(direction)
+            uy = math.sin(direction)
+            away = rho / math.cos(0.5 * turn / parts)
+            x = ex + away * ux
+            y = ey + away * uy
+            if clearance(x, y, walls, start, items, REACH) < need:
+                # A narrow passage: stand in the middle between the end and what faces it.
+                low = -1.0
+                for step in range(12):
+                    d = need + 0.02 + step * (rho + 0.1 - need) / 11.0
+                    c = clearance(ex + d * ux, ey + d * uy, walls, start, items, REACH)
+                    if c >= need and c > low:
+                        low = c
+                        x = ex + d * ux
+                        y = ey + d * uy
+                if low < 0.0:
+                    continue
+            if count == out.shape[0]:
+                break
+            out[count, 0] = x
+            out[count, 1] = y
+            shape[count, 0] = ex
+            shape[count, 1] = ey
+            shape[count, 2] = math.cos(a)
+            shape[count, 3] = math.sin(a)
+            shape[count, 4] = math.cos(b)
+            shape[count, 5] = math.sin(b)
+            shape[count, 6] = 0.0 if lone else 1.0
+            count += 1
+    return out[:count].copy(), shape[:count].copy()
+
+
+@njit(cache=True)
+def distinct(candidates, position, kind, n_vertices):
+    """Which candidates (m, 2) stand clear of all living corner vertices and of earlier candidates."""
+    m = candidates.shape[0]
+    keep = np.ones(m, np.bool_)
+    for i in range(m):
+        x = candidates[i, 0]
+        y = candidates[i, 1]
+        for v in range(n_vertices):
+            if kind[v] == CORNER and abs(position[v, 0] - x) < _SPACING and abs(position[v, 1] - y) < _SPACING:
+                keep[i] = False
+                break
+        for j in range(i):
+            if (
+                keep[i]
+                and keep[j]
+                and abs(candidates[j, 0] - x) < _SPACING
+                and abs(candidates[j, 1] - y) < _SPACING
+            ):
+                keep[i] = False
+                break
+    return keep
+
+
+@njit(cache=True, inline="always")
+def _tangent(dx, dy, x, y, shape):
+    """Whether a path in direction d through a corner vertex can be taut: all of the corner on one side."""
+    if shape[6] == 0.0:
+        return True
+    side = dx * (shape[1] - y) - dy * (shape[0] - x)
+    slack = 0.1 * (abs(dx) + abs(dy))
+    c1 = dx * shape[3] - dy * shape[2]
+    c2 = dx * shape[5] - dy * shape[4]
+    if side > 0.0:
+        return c1 >= -slack and c2 >= -slack
+    return c1 <= slack and c2 <= slack
+
+
+@njit(cache=True)
+def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, pieces, p_start, p_items, owner,
+            vertex_owner, need, relaxed, slack):  # fmt: skip
+    """New edges between the `fresh` vertices and all others: (e, 2) vertices, lengths, states, needs.
+
+    `relaxed[v]` is the clearance that a leaf can offer where it stands (a bumped robot may stand
+    nearer to a wall than paths do); `slack` how near (m) to a leaf an open edge may be crossed.
+    """
+    capacity = 256
+    pairs = np.empty((capacity, 2), np.int64)
+    length = np.empty(capacity)
+    state = np.empty(capacity, np.int8)
+    wants = np.empty(capacity)
+    count = 0
+    rank = np.full(n_vertices, -1, np.int64)
+    for i in range(fresh.size):
+        rank[fresh[i]] = i
+    for i in range(fresh.size):
+        u = fresh[i]
+        ux = position[u, 0]
+        uy = position[u, 1]
+        for v in range(n_vertices):
+            if v == u or kind[v] < 0 or rank[v] > i:
+                continue
+            dx = position[v, 0] - ux
+            dy = position[v, 1] - uy
+            if abs(dx) > _MAX_EDGE or abs(dy) > _MAX_EDGE:
+                continue
+            if kind[u] == CORNER and not _tangent(dx, dy, ux, uy, shape[u]):
+                continue
+            if kind[v] == CORNER and not _tangent(dx, dy, position[v, 0], position[v, 1], shape[v]):
+                continue
+            d = math.hypot(dx, dy)
+            if d > _MAX_EDGE:
+                continue
+            want = min(need, relaxed[u], relaxed[v])
+            if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
+                continue
+            free = crossing_free(
+                ux, uy, position[v, 0], position[v, 1], pieces, p_start, p_items, owner,
+                vertex_owner[u], vertex_owner[v],
+                slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
+            )  # fmt: skip
+            if count == capacity:
+                capacity *= 2
+                pairs = np.concatenate((pairs, np.empty((count, 2), np.int64)))
+                length = np.concatenate((length, np.empty(count)))
+                state = np.concatenate((state, np.empty(count, np.int8)))
+                wants = np.concatenate((wants, np.empty(count)))
+            pairs[count, 0] = u
+            pairs[count, 1] = v
+            length[count] = d
+            state[count] = OPEN if free else BLOCKED
+            wants[count] = want
+            count += 1
+    return pairs[:count].copy(), length[:count].copy(), state[:count].copy(), wants[:count].copy()
+
+
+@njit(cache=True)
+def unblock(ends, state, n_edges, position, kind, box, pieces, p_start, p_items, owner, vertex_owner, slack):
+    """Open the blocked edges meeting `box` (x0, y0, x1, y1) that no open edge crosses any more; which."""
+    opened = np.empty(n_edges, np.int64)
+    count = 0
+    for e in range(n_edges):
+        if state[e] != BLOCKED:
+            continue
+        u = ends[e, 0]
+        v = ends[e, 1]
+        ax = position[u, 0]
+        ay = position[u, 1]
+        bx = position[v, 0]
+        by = position[v, 1]
+        if max(ax, bx) < box[0] or min(ax, bx) > box[2] or max(ay, by) < box[1] or min(ay, by) > box[3]:
+            continue
+        if crossing_free(
+            ax, ay, bx, by, pieces, p_start, p_items, owner, vertex_owner[u], vertex_owner[v],
+            slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
+        ):  # fmt: skip
+            state[e] = OPEN
+            opened[count] = e
+            count += 1
+    return opened[:count].copy()
+
+
+@njit(cache=True)
+def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shape, walls, need):
+    """Kill the corner vertices and the edges that new walls (m, 4) come too near to; the edges that were open."""
+    killed = np.empty(n_edges, np.int64)
+    count = 0
+    if walls.shape[0] == 0:
+        return killed[:0].copy()
+    x0 = min(walls[:, 0].min(), walls[:, 2].min()) - need
+    x1 = max(walls[:, 0].max(), walls[:, 2].max()) + need
+    y0 = min(walls[:, 1].min(), walls[:, 3].min()) - need
+    y1 = max(walls[:, 1].max(), walls[:, 3].max()) + need
+    for v in range(n_vertices):
+        x = position[v, 0]
+        y = position[v, 1]
+        if kind[v] != CORNER or x < x0 or x > x1 or y < y0 or y > y1:
+            continue
+        for w in range(walls.shape[0]):
+            if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.005:
+                kind[v] = -1
+                break
+    for e in range(n_edges):
+        if state[e] == DEAD:
+            continue
+        u = ends[e, 0]
+        v = ends[e, 1]
+        dead = kind[u] < 0 or kind[v] < 0
+        if not dead:
+            ax = position[u, 0]
+            ay = position[u, 1]
+            bx = position[v, 0]
+            by = position[v, 1]
+            ex0 = min(ax, bx) - need
+            ex1 = max(ax, bx) + need
+            ey0 = min(ay, by) - need
+            ey1 = max(ay, by) + need
+            if ex1 < x0 or ex0 > x1 or ey1 < y0 or ey0 > y1:
+                continue
+            for w in range(walls.shape[0]):
+                if (
+                    max(walls[w, 0], walls[w, 2]) < ex0
+                    or min(walls[w, 0], walls[w, 2]) > ex1
+                    or max(walls[w, 1], walls[w, 3]) < ey0
+                    or min(walls[w, 1], walls[w, 3]) > ey1
+                ):
+                    continue
+                # A wall refitted a few millimetres nearer does not cut the edge: it would flicker.
+                if (
+                    segment_distance(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+                    < wants[e] - 0.005
+                ):
+                    dead = True
+                    break
+        if dead:
+            if state[e] == OPEN:
+                killed[count] = e
+                count += 1
+            state[e] = DEAD
+    return killed[:count].copy()
+
+
+@njit(cache=True)
+def link_edges(ends, first, last, head, nxt):
+    """Thread the edges `first` to `last` into the adjacency lists (half-edge 2e at its u, 2e + 1 at its v)."""
+    for e in range(first, last):
+        for side in range(2):
+            v = ends[e, side]
+            h = 2 * e + side
+            nxt[h] = head[v]
+            head[v] = h
+
+
+@njit(cache=True, inline="always")
+def _push(heap_d, heap_v, size, d, v):
+    i = size
+    while i > 0:
+        p = (i - 1) >> 1
+        if heap_d[p] <= d:
+            break
+        heap_d[i] = heap_d[p]
+        heap_v[i] = heap_v[p]
+        i = p
+    heap_d[i] = d
+    heap_v[i] = v
+
+
+@njit(cache=True, inline="always")
+def _pop(heap_d, heap_v, size):
+    """Removes the top (read it before); `size` is the size before."""
+    d = heap_d[size - 1]
+    v = heap_v[size - 1]
+    n = size - 1
+    i = 0
+    while True:
+        c = 2 * i + 1
+        if c >= n:
+            break
+        if c + 1 < n and heap_d[c + 1] < heap_d[c]:
+            c += 1
+        if heap_d[c] >= d:
+            break
+        heap_d[i] = heap_d[c]
+        heap_v[i] = heap_v[c]
+        i = c
+    heap_d[i] = d
+    heap_v[i] = v
+
+
+@njit(cache=True)
+def _settle(dist, parent, source, heap_d, heap_v, size, ends, state, length, head, nxt, kind):
+    """Dijkstra from a heap that is already filled; leaves but the source are not gone through."""
+    while size > 0:
+        d = heap_d[0]
+        v = heap_v[0]
+        _pop(heap_d, heap_v, size)
+        size -= 1
+        if d > dist[v] or (kind[v] == LEAF and v != source):
+            continue
+        h = head[v]
+        while h >= 0:
+            e = h >> 1
+            if state[e] == OPEN:
+                w = ends[e, 1 - (h & 1)]
+                nd = d + length[e]
+                if nd < dist[w]:
+                    dist[w] = nd
+                    parent[w] = v
+                    if kind[w] != LEAF:
+                        if size == heap_d.size:
+                            heap_d = np.concatenate((heap_d, np.empty(size)))
+                            heap_v = np.concatenate((heap_v, np.empty(size, np.int64)))
+                        _push(heap_d, heap_v, size, nd, w)
+                        size += 1
+            h = nxt[h]
+
+
+@njit(cache=True)
+def search(dist, parent, source, ends, state, length, head, nxt, kind, n_vertices):
+    """Fill the field of one source: shortest distances (v,) and the parents on the way back to it."""
+    for v in range(n_vertices):
+        dist[v] = math.inf
+        parent[v] = -1
+    dist[source] = 0.0
+    heap_d = np.empty(1024)
+    heap_v = np.empty(1024, np.int64)
+    heap_d[0] = 0.0
+    heap_v[0] = source
+    _settle(dist, parent, source, heap_d, heap_v, 1, ends, state, length, head, nxt, kind)
+
+
+@njit(cache=True)
+def repair(dist, parent, sources, killed, added, ends, state, length, head, nxt, kind):
+    """Repair the fields dist, parent (k, v) of `sources` after edges were killed and added (or opened)."""
+    n = dist.shape[1]
+    affected = np.empty(n, np.int64)
+    for k in range(sources.size):
+        s = sources[k]
+        d = dist[k]
+        p = parent[k]
+        n_hit = 0
+        for i in range(killed.size):
+            e = killed[i]
+            for side in range(2):
+                v = ends[e, side]
+                if p[v] == ends[e, 1 - side] and d[v] < math.inf:
+                    p[v] = -1
+                    d[v] = math.inf
+                    affected[n_hit] = v
+                    n_hit += 1
+        i = 0
+        while i < n_hit:
+            v = affected[i]
+            i += 1
+            h = head[v]
+            while h >= 0:
+                w = ends[h >> 1, 1 - (h & 1)]
+                if p[w] == v and d[w] < math.inf:
+                    p[w] = -1
+                    d[w] = math.inf
+                    affected[n_hit] = w
+                    n_hit += 1
+                h = nxt[h]
+        heap_d = np.empty(256 + n_hit + 2 * added.size)
+        heap_v = np.empty(heap_d.size, np.int64)
+        size = 0
+        for i in range(n_hit):
+            v = affected[i]
+            h = head[v]
+            while h >= 0:
+                e = h >> 1
+                if state[e] == OPEN:
+                    w = ends[e, 1 - (h & 1)]
+                    if (kind[w] != LEAF or w == s) and d[w] + length[e] < d[v]:
+                        d[v] = d[w] + length[e]
+                        p[v] = w
+                h = nxt[h]
+            if d[v] < math.inf and kind[v] != LEAF:
+                _push(heap_d, heap_v, size, d[v], v)
+                size += 1
+        for i in range(added.size):
+            e = added[i]
+            if state[e] != OPEN:
+                continue
+            for side in range(2):
+                v = ends[e, side]
+                w = ends[e, 1 - side]
+                if (kind[w] != LEAF or w == s) and d[w] + length[e] < d[v]:
+                    d[v] = d[w] + length[e]
+                    p[v] = w
+                    if kind[v] != LEAF:
+                        _push(heap_d, heap_v, size, d[v], v)
+                        size += 1
+        _settle(d, p, s, heap_d, heap_v, size, ends, state, length, head, nxt, kind)
+
+
+@njit(cache=True)
+def reachable(root, ends, state, head, nxt, kind, n_vertices):
+    """Which vertices an open path joins to `root`."""
+    seen = np.zeros(n_vertices, np.bool_)
+    stack = np.empty(n_vertices, np.int64)
+    stack[0] = root
+    seen[root] = True
+    size = 1
+    while size > 0:
+        size -= 1
+        v = stack[size]
+        if kind[v] == LEAF and v != root:
+            continue
+        h = head[v]
+        while h >= 0:
+            e = h >> 1
+            if state[e] == OPEN:
+                w = ends[e, 1 - (h & 1)]
+                if not seen[w]:
+                    seen[w] = True
+                    stack[size] = w
+                    size += 1
+            h = nxt[h]
+    return seen
+
+
+class PathGraph:
+    """Owner of the graph. Positions in the map frame, lengths in metres."""
+
+    def __init__(self, radius: float, spare: float, tolerance: float) -> None:
+        """`radius` of the disc; corners are passed at radius + `spare`, and nothing nearer than radius + `tolerance`."""
+        self.radius = radius
+        self.rho = radius + spare
+        self.need = radius + tolerance
+        self.n_vertices = 0
+        self.position = np.zeros((256, 2))
+        self.shape = np.zeros((256, 7))
+        self.kind = np.full(256, -1, np.int8)
+        self.relaxed = np.full(256, math.inf)
+        self.owner = np.full(256, -1, np.int64)
+        self.head = np.full(256, -1, np.int64)
+        self.n_edges = 0
+        self.ends = np.zeros((1024, 2), np.int64)
+        self.length = np.zeros(1024)
+        self.state = np.zeros(1024, np.int8)
+        self.wants = np.zeros(1024)
+        self.nxt = np.full(2048, -1, np.int64)
+        self.free_ids: list[int] = []
+        self._fresh = np.zeros(0, np.int64)
+        self.sources = np.zeros(0, np.int64)
+        self.dist = np.zeros((0, 256))
+        self.parent = np.zeros((0, 256), np.int64)
+        self.walls = np.zeros((0, 4))
+        self.wall_grid = build_grid(self.walls, np.zeros(0, np.bool_), REACH)
+        self.pieces = np.zeros((0, 4))
+        self.piece_owner = np.zeros(0, np.int64)
+        self.piece_grid = build_grid(self.pieces, np.zeros(0, np.bool_), 0.0)
+        self._killed: list[np.ndarray] = []
+        self._added: list[np.ndarray] = []
+
+    # Obstacles -------------------------------------------------------------------------------
+
+    def set_walls(self, walls: np.ndarray, alive: np.ndarray, touched: np.ndarray) -> None:
+        """Take over the walls (m, 4) of the line map; `touched` rows changed since the last call."""
+        self.walls = walls
+        self.wall_grid = build_grid(walls, alive, REACH)
+        rows = touched[alive[touched]]
+        killed = block_by_walls(
+            self.ends, self.state, self.wants, self.n_edges, self.position, self.kind, self.n_vertices, self.shape,
+            walls[rows], self.need,
+        )  # fmt: skip
+        if killed.size:
+            self._killed.append(killed)
+        ends = np.concatenate((walls[rows, :2], walls[rows, 2:]))
+        candidates, shape = corner_vertices(ends, walls, *self.wall_grid, self.rho, self.need)
+        keep = distinct(candidates, self.position, self.kind, self.n_vertices)
+        self._fresh = self._new_vertices(candidates[keep], shape[keep])
+
+    def set_pieces(self, pieces: np.ndarray, owner: np.ndarray) -> None:
+        """Take over the open edges (m, 4) and the chain that owns each; opens what they no longer block."""
+        self.pieces = pieces
+        self.piece_owner = owner
+        self.piece_grid = build_grid(pieces, np.ones(len(pieces), np.bool_), 0.0)
+
+    def refresh(self, box: np.ndarray, slack: float) -> None:
+        """After walls and open edges were set: open blocked edges meeting `box`, connect the new corners."""
+        opened = unblock(
+            self.ends, self.state, self.n_edges, self.position, self.kind, box, self.pieces, *self.piece_grid,
+            self.piece_owner, self.owner, slack,
+        )  # fmt: skip
+        if opened.size:
+            self._added.append(opened)
+        self._connect(self._fresh, slack)
+
+    def repair(self) -> None:
+        """Bring all distance fields up to date."""
+        killed = np.concatenate(self._killed) if self._killed else np.zeros(0, np.int64)
+        added = np.concatenate(self._added) if self._added else np.zeros(0, np.int64)
+        self._killed, self._added = [], []
+        if len(self.sources) and (killed.size or added.size):
+            repair(self.dist, self.parent, self.sources, killed, added, self.ends, self.state, self.length,
+                   self.head, self.nxt, self.kind)  # fmt: skip
+
+    # Vertices --------------------------------------------------------------------------------
+
+    def clearance(self, x: float, y: float) -> float:
+        """Distance to the nearest wall, m, `REACH` at most."""
+        return float(clearance(x, y, self.walls, *self.wall_grid, REACH))
+
+    def add_leaf(self, x: float, y: float, owner: int, slack: float) -> int:
+        """A vertex where paths end, connected to all that it sees. Returns its index."""
+        at = self._new_vertices(np.array([[x, y]]), np.zeros((1, 7)), LEAF, owner)
+        v = int(at[0])
+        self.relaxed[v] = max(self.clearance(x, y) - 0.005, 0.05)
+        self._connect(at, slack)
+        return v
+
+    def remove_leaf(self, v: int) -> None:
+        """Take a leaf out; no other path leads through it."""
+        h = self.head[v]
+        while h >= 0:
+            self.state[h >> 1] = DEAD
+            h = self.nxt[h]
+        self.kind[v] = -1
+        self.dist[:, v] = math.inf
+        self.parent[:, v] = -1
+        self.free_ids.append(v)
+
+    def _new_vertices(self, position: np.ndarray, shape: np.ndarray, kind: int = CORNER, owner: int = -1) -> np.ndarray:
+        m = len(position)
+        if kind == LEAF and self.free_ids:
+            ids = np.array([self.free_ids.pop() for _ in range(m)])
+        else:
+            self._grow_vertices(self.n_vertices + m)
+            ids = np.arange(self.n_vertices, self.n_vertices + m)
+            self.n_vertices += m
+        self.position[ids] = position
+        self.shape[ids] = shape
+        self.kind[ids] = kind
+        self.owner[ids] = owner
+        self.relaxed[ids] = math.inf
+        self.head[ids] = -1
+        return ids
+
+    def _grow_vertices(self, size: int) -> None:
+        capacity = len(self.kind)
+        if size <= capacity:
+            return
+        while capacity < size:
+            capacity *= 2
+        extra = capacity - len(self.kind)
+        self.position = np.concatenate((self.position, np.zeros((extra, 2))))
+        self.shape = np.concatenate((self.shape, np.zeros((extra, 7))))
+        self.kind = np.concatenate((self.kind, np.full(extra, -1, np.int8)))
+        self.relaxed = np.concatenate((self.relaxed, np.full(extra, math.inf)))
+        self.owner = np.concatenate((self.owner, np.full(extra, -1, np.int64)))
+        self.head = np.concatenate((self.head, np.full(extra, -1, np.int64)))
+        k = len(self.sources)
+        self.dist = np.concatenate((self.dist, np.full((k, extra), math.inf)), axis=1)
+        self.parent = np.concatenate((self.parent, np.full((k, extra), -1, np.int64)), axis=1)
+
+    def _connect(self, fresh: np.ndarray, slack: float) -> None:
+        if not len(fresh):
+            return
+        pairs, length, state, wants = connect(
+            fresh, self.position, self.shape, self.kind, self.n_vertices, self.walls, *self.wall_grid,
+            self.pieces, *self.piece_grid, self.piece_owner, self.owner, self.need, self.relaxed, slack,
+        )  # fmt: skip
+        m = len(pairs)
+        first = self.n_edges
+        if first + m > len(self.state):
+            extra = max(first + m - len(self.state), len(self.state))
+            self.ends = np.concatenate((self.ends, np.zeros((extra, 2), np.int64)))
+            self.length = np.concatenate((self.length, np.zeros(extra)))
+            self.state = np.concatenate((self.state, np.zeros(extra, np.int8)))
+            self.wants = np.concatenate((self.wants, np.zeros(extra)))
+            self.nxt = np.concatenate((self.nxt, np.full(2 * extra, -1, np.int64)))
+        rows = slice(first, first + m)
+        self.ends[rows] = pairs
+        self.length[rows] = length
+        self.state[rows] = state
+        self.wants[rows] = wants
+        self.n_edges += m
+        link_edges(self.ends, first, self.n_edges, self.head, self.nxt)
+        self._added.append(np.arange(first, self.n_edges))
+
+    def compact(self) -> None:
+        """Drop dead edges and give back the indices of removed leaves. Call after `repair`."""
+        alive = np.flatnonzero(self.state[: self.n_edges])
+        if len(alive) > 0.6 * self.n_edges or self.n_edges < 512:
+            return
+        n = len(alive)
+        self.ends[:n] = self.ends[alive]
+        self.length[:n] = self.length[alive]
+        self.state[:n] = self.state[alive]
+        self.wants[:n] = self.wants[alive]
+        self.state[n:] = DEAD
+        self.n_edges = n
+        self.head[:] = -1
+        link_edges(self.ends, 0, n, self.head, self.nxt)
+
+    # Fields ----------------------------------------------------------------------------------
+
+    def set_sources(self, vertices: np.ndarray, rows: np.ndarray) -> None:
+        """The vertices to keep distance fields for; `rows` names the old row of each, -1 where it is new."""
+        capacity = len(self.kind)
+        dist = np.full((len(vertices), capacity), math.inf)
+        parent = np.full((len(vertices), capacity), -1, np.int64)
+        kept = rows >= 0
+        dist[kept] = self.dist[rows[kept]]
+        parent[kept] = self.parent[rows[kept]]
+        self.dist, self.parent, self.sources = dist, parent, np.asarray(vertices, np.int64)
+        for k in np.flatnonzero(~kept):
+            search(dist[k], parent[k], self.sources[k], self.ends, self.state, self.length, self.head, self.nxt,
+                   self.kind, self.n_vertices)  # fmt: skip
+
+    def path(self, row: int, vertex: int) -> np.ndarray:
+        """Way points (k, 2) from a vertex to the source of a field, both included."""
+        points = [self.position[vertex]]
+        v = vertex
+        while v != self.sources[row]:
+            v = int(self.parent[row, v])
+            points.append(self.position[v])
+        return np.array(points)
+
+    def reachable(self, root: int) -> np.ndarray:
+        """Which vertices (n_vertices,) an open path joins to `root`."""
+        return reachable(root, self.ends, self.state, self.head, self.nxt, self.kind, self.n_vertices)

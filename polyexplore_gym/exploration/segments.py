@@ -1,0 +1,195 @@
+"""Elementary geometry of segments and a hashed grid over them: kernels shared by this package."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+CELL = 1.0
+"""Side of a grid cell, m."""
+
+
+@njit(cache=True, inline="always")
+def point_segment_distance(px, py, x1, y1, x2, y2):
+    """Distance from a point to a segment."""
+    dx = x2 - x1
+    dy = y2 - y1
+    q = dx * dx + dy * dy
+    t = 0.0
+    if q > 0.0:
+        t = ((px - x1) * dx + (py - y1) * dy) / q
+        t = min(max(t, 0.0), 1.0)
+    return math.hypot(px - x1 - t * dx, py - y1 - t * dy)
+
+
+@njit(cache=True, inline="always")
+def crossing(ax, ay, bx, by, cx, cy, dx, dy):
+    """Parameter along a-b where it properly crosses c-d, or -1."""
+    ux = bx - ax
+    uy = by - ay
+    vx = dx - cx
+    vy = dy - cy
+    den = ux * vy - uy * vx
+    if den == 0.0:
+        return -1.0
+    wx = cx - ax
+    wy = cy - ay
+    t = (wx * vy - wy * vx) / den
+    s = (wx * uy - wy * ux) / den
+    if 0.0 <= t <= 1.0 and 0.0 <= s <= 1.0:
+        return t
+    return -1.0
+
+
+@njit(cache=True)
+def segment_distance(ax, ay, bx, by, cx, cy, dx, dy):
+    """Distance between two segments."""
+    if crossing(ax, ay, bx, by, cx, cy, dx, dy) >= 0.0:
+        return 0.0
+    d = point_segment_distance(ax, ay, cx, cy, dx, dy)
+    d = min(d, point_segment_distance(bx, by, cx, cy, dx, dy))
+    d = min(d, point_segment_distance(cx, cy, ax, ay, bx, by))
+    return min(d, point_segment_distance(dx, dy, ax, ay, bx, by))
+
+
+@njit(cache=True, inline="always")
+def bucket(ix, iy, mask):
+    """Hash of a grid cell."""
+    return ((ix * 73856093) ^ (iy * 19349663)) & mask
+
+
+@njit(cache=True)
+def build_grid(segments, alive, margin):
+    """Hashed grid over segments: `start` (buckets + 1,) and `items`, each cell within `margin` m of it.
+
+    A bucket may hold segments of several cells: a query finds a superset.
+    """
+    n = segments.shape[0]
+    size = 256
+    while size < 4 * n:
+        size *= 2
+    mask = size - 1
+    start = np.zeros(size + 1, np.int64)
+    reach = margin + 0.5 * math.sqrt(2.0) * CELL
+    items = np.empty(0, np.int64)
+    for pass_ in range(2):
+        if pass_ == 1:
+            for b in range(size):
+                start[b + 1] += start[b]
+            items = np.empty(start[size], np.int64)
+            fill = start[:-1].copy()
+        for i in range(n):
+            if not alive[i]:
+                continue
+            x1 = segments[i, 0]
+            y1 = segments[i, 1]
+            x2 = segments[i, 2]
+            y2 = segments[i, 3]
+            ix0 = int(math.floor((min(x1, x2) - margin) / CELL))
+            ix1 = int(math.floor((max(x1, x2) + margin) / CELL))
+            iy0 = int(math.floor((min(y1, y2) - margin) / CELL))
+            iy1 = int(math.floor((max(y1, y2) + margin) / CELL))
+            small = (ix1 - ix0 + 1) * (iy1 - iy0 + 1) <= 4
+            for ix in range(ix0, ix1 + 1):
+                for iy in range(iy0, iy1 + 1):
+                    if (
+                        not small
+                        and point_segment_distance((ix + 0.5) * CELL, (iy + 0.5) * CELL, x1, y1, x2, y2) > reach
+                    ):
+                        continue
+                    b = bucket(ix, iy, mask)
+                    if pass_ == 0:
+                        start[b + 1] += 1
+                    else:
+                        items[fill[b]] = i
+                        fill[b] += 1
+    return start, items
+
+
+@njit(cache=True)
+def clearance(px, py, segments, start, items, limit):
+    """Distance from a point to the nearest segment, or `limit` if that is less (<= the grid's margin)."""
+    mask = start.size - 2
+    b = bucket(int(math.floor(px / CELL)), int(math.floor(py / CELL)), mask)
+    best = limit
+    for e in range(start[b], start[b + 1]):
+        i = items[e]
+        d = point_segment_distance(px, py, segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3])
+        best = min(best, d)
+    return best
+
+
+@njit(cache=True)
+def sweep_free(ax, ay, bx, by, segments, start, items, radius):
+    """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
+    mask = start.size - 2
+    ix = int(math.floor(ax / CELL))
+    iy = int(math.floor(ay / CELL))
+    jx = int(math.floor(bx / CELL))
+    jy = int(math.floor(by / CELL))
+    dx = bx - ax
+    dy = by - ay
+    sx = 1 if dx > 0 else -1
+    sy = 1 if dy > 0 else -1
+    tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
+    ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
+    steps = abs(jx - ix) + abs(jy - iy)
+    x0 = min(ax, bx) - radius
+    x1 = max(ax, bx) + radius
+    y0 = min(ay, by) - radius
+    y1 = max(ay, by) + radius
+    for _ in range(steps + 1):
+        b = bucket(ix, iy, mask)
+        for e in range(start[b], start[b + 1]):
+            i = items[e]
+            cx = segments[i, 0]
+            cy = segments[i, 1]
+            ex = segments[i, 2]
+            ey = segments[i, 3]
+            if max(cx, ex) < x0 or min(cx, ex) > x1 or max(cy, ey) < y0 or min(cy, ey) > y1:
+                continue
+            if segment_distance(ax, ay, bx, by, cx, cy, ex, ey) < radius:
+                return False
+        if tx < ty:
+            ix += sx
+            tx += CELL / abs(dx)
+        else:
+            iy += sy
+            ty += CELL / abs(dy) if dy != 0.0 else math.inf
+    return True
+
+
+@njit(cache=True)
+def crossing_free(ax, ay, bx, by, segments, start, items, owner, own_a, own_b, slack_a, slack_b):
+    """Whether a-b crosses no segment, but within `slack_a` m of a, `slack_b` m of b, or those of its owners."""
+    mask = start.size - 2
+    ix = int(math.floor(ax / CELL))
+    iy = int(math.floor(ay / CELL))
+    jx = int(math.floor(bx / CELL))
+    jy = int(math.floor(by / CELL))
+    dx = bx - ax
+    dy = by - ay
+    length = math.hypot(dx, dy)
+    sx = 1 if dx > 0 else -1
+    sy = 1 if dy > 0 else -1
+    tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
+    ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
+    steps = abs(jx - ix) + abs(jy - iy)
+    for _ in range(steps + 1):
+        b = bucket(ix, iy, mask)
+        for e in range(start[b], start[b + 1]):
+            i = items[e]
+            if owner[i] >= 0 and (owner[i] == own_a or owner[i] == own_b):
+                continue
+            t = crossing(ax, ay, bx, by, segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3])
+            if t >= 0.0 and t * length >= slack_a and (1.0 - t) * length >= slack_b:
+                return False
+        if tx < ty:
+            ix += sx
+            tx += CELL / abs(dx)
+        else:
+            iy += sy
+            ty += CELL / abs(dy) if dy != 0.0 else math.inf
+    return True
