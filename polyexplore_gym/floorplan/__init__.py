@@ -2,5 +2,6 @@
 
 from polyexplore_gym.floorplan.formats import load_plan, save_plan, to_geojson
 from polyexplore_gym.floorplan.model import FloorPlan
+from polyexplore_gym.floorplan.suites import FAMILIES, Suite, generate, list_suites, suite
 
-__all__ = ["FloorPlan", "load_plan", "save_plan", "to_geojson"]
+__all__ = ["FAMILIES", "FloorPlan", "Suite", "generate", "list_suites", "load_plan", "save_plan", "suite", "to_geojson"]

@@ -44,21 +44,26 @@ def load_ros_map(
     free = (occupancy < fields["free_thresh"]) & (occupancy <= fields["occupied_thresh"]) & opaque
     seed = None if start is None else _pixel_of(start, free.shape, resolution, origin)
     tolerance_px = 1.0 if tolerance is None else tolerance / resolution
-    # The simplification may narrow a passage from both sides; what is kept must stay passable.
-    reach = radius / resolution + tolerance_px if radius > 0 else 0.0
-    polygon = _simplify(vectorise(select_region(free, reach, seed)), tolerance_px)
     cos, sin = math.cos(origin[2]), math.sin(origin[2])
     to_metres = np.array([[cos, -sin], [sin, cos]]) * resolution
 
     def place(ring: Any) -> np.ndarray:
         return np.asarray(ring.coords)[:-1] @ to_metres.T + origin[:2]
 
-    return FloorPlan.create(
-        place(polygon.exterior),
-        [place(ring) for ring in polygon.interiors],
-        name=path.stem,
-        meta={"format": "ROS map", "resolution": resolution, "origin": list(origin), "image": fields["image"]},
-    )
+    def build(reach: float) -> FloorPlan:
+        polygon = _simplify(vectorise(select_region(free, reach, seed)), tolerance_px)
+        meta = {"format": "ROS map", "resolution": resolution, "origin": list(origin), "image": fields["image"]}
+        holes = [place(ring) for ring in polygon.interiors]
+        return FloorPlan.create(place(polygon.exterior), holes, name=path.stem, meta=meta)
+
+    plan = build(radius / resolution)
+    try:
+        if radius > 0:
+            plan.check_connected(radius)
+        return plan
+    except InvalidFloorPlanError:
+        # The simplification narrowed a passage; ask for that much more room beforehand.
+        return build(radius / resolution + tolerance_px)
 
 
 def select_region(free: np.ndarray, radius: float, seed: tuple[int, int] | None = None) -> np.ndarray:
