@@ -1,0 +1,31 @@
+"""The one thing that the scripted policies share: the best of the reachable nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+
+def best(score: np.ndarray, observation: Mapping[str, np.ndarray]) -> int:
+    """Index of the highest score among the nodes that can be chosen; ties go to the lower index.
+
+    Args:
+        score: (max_nodes,) one a slot; those of masked slots are not looked at.
+        observation: its `action_mask` (max_nodes,) says which slots can be chosen.
+
+    Raises:
+        ValueError: no node can be chosen, or a reachable node's score is not a number.
+    """
+    reachable = np.flatnonzero(observation["action_mask"])
+    if len(reachable) == 0:
+        raise ValueError("no node can be chosen: the episode is over")
+    scores = np.asarray(score, dtype=np.float64)[reachable]
+    if np.isnan(scores).any():
+        raise ValueError("the score of a reachable node is not a number")
+    return int(reachable[np.argmax(scores)])
+
+
+def column(observation: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """(max_nodes,) a quantity of all nodes in double precision, so that scores do not round to ties."""
+    return np.asarray(observation[name], dtype=np.float64)

@@ -1,0 +1,205 @@
+"""Pictures of a study. Matplotlib is imported when first needed: `pip install "polyexplore-gym[plots]"`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from polyexplore_gym.config import EnvConfig
+from polyexplore_gym.errors import MissingDependencyError, ResultsError
+from polyexplore_gym.evaluation.episode import run_episode
+from polyexplore_gym.evaluation.policy import PolicySpec, load_policy, policy_label
+from polyexplore_gym.evaluation.records import EpisodeRecord
+from polyexplore_gym.evaluation.runner import MakeEnv, make_env
+from polyexplore_gym.evaluation.statistics import coverage_at, resampled_weights
+from polyexplore_gym.evaluation.summary import Comparison, Summary
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, and dashes beside them: told apart by the colour-blind and in grey print.
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (4, 1.5, 1, 1.5)))
+_INK = "#333333"
+
+
+def coverage_figure(
+    records: Sequence[EpisodeRecord],
+    rng: np.random.Generator,
+    *,
+    reference: str = "nearest",
+    resamples: int = 1000,
+) -> Figure:
+    """Coverage against the distance driven: mean over the starts, with its 95 % interval over buildings.
+
+    Distances are divided by what the reference policy drove on the same plan, start and placement to
+    complete the map, so that small and large plans can be averaged. Only starts that all policies
+    completed at a placement are in it (as in `summarize`); one panel a placement.
+    """
+    placements = list(dict.fromkeys(r.placement for r in records))
+    policies = list(dict.fromkeys(r.policy for r in records))
+    figure = _figure(4.6 * len(placements) + 0.4, 3.9)
+    grid = np.linspace(0.0, 1.6, 161)
+    panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
+    for panel, placement in zip(panels, placements, strict=True):
+        found = {(r.policy, r.plan_hash, r.seed): r for r in records if r.placement == placement and r.complete}
+        compared = [p for p in policies if any(key[0] == p for key in found)]
+        base = reference if reference in compared else next(iter(compared), "")
+        pairs = [
+            key[1:]
+            for key, r in found.items()
+            if key[0] == base and r.distance > 0 and all((p, *key[1:]) in found for p in compared)
+        ]
+        for policy in compared if pairs else ():
+            runs = [found[(policy, *pair)] for pair in pairs]
+            scale = [found[(base, *pair)].distance for pair in pairs]
+            curves = np.array(
+                [
+                    coverage_at(np.array(r.curve_distance), np.array(r.curve_coverage), grid * s)
+                    for r, s in zip(runs, scale, strict=True)
+                ]
+            )
+            color, dash = _style(policies.index(policy))
+            panel.plot(grid, 100 * curves.mean(axis=0), color=color, linestyle=dash, linewidth=1.6, label=policy)
+            if len({r.group for r in runs}) > 1:
+                weights = resampled_weights([r.group for r in runs], [r.stratum for r in runs], rng, resamples)
+                low, high = np.quantile(weights @ curves / weights.sum(axis=1, keepdims=True), [0.025, 0.975], axis=0)
+                panel.fill_between(grid, 100 * low, 100 * high, color=color, alpha=0.12, linewidth=0)
+        panel.set_title(f"{placement} ({len(pairs)} starts)", fontsize=10, color=_INK)
+        panel.set_xlabel(f"distance / that of {base} until complete" if base else "distance", fontsize=9)
+        panel.set_xlim(0.0, grid[-1])
+        _plain(panel)
+    panels[0].set_ylabel("area seen, %", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        panels[-1].legend(handles, labels, fontsize=8, frameon=False, loc="lower right")
+    return figure
+
+
+def ratio_figure(summary: Summary) -> Figure:
+    """Distance over that of the reference: every start a dot, the geometric mean with its interval above it."""
+    comparisons = [*summary.against_reference, *summary.between_placements]
+    comparisons = [c for c in comparisons if c.pairs]
+    figure = _figure(7.0, 1.3 + 0.42 * max(len(comparisons), 1))
+    panel = figure.subplots()
+    span = [1.0]
+    for row, c in enumerate(comparisons):
+        ratios = np.array(c.ratios)
+        span += [float(np.quantile(ratios, 0.02)), float(np.quantile(ratios, 0.98)), c.ratio.low, c.ratio.high]
+        # A fixed ripple keeps dots apart; it means nothing.
+        ripple = 0.11 * np.sin(2.4 * np.arange(len(ratios)))
+        panel.scatter(ratios, row + 0.2 + ripple, s=7, color="#8a8a8a", alpha=0.5, linewidths=0)
+        color = _COLORS[0] if c.ours[1] == c.theirs[1] else _COLORS[1]
+        panel.plot([c.ratio.low, c.ratio.high], [row - 0.12] * 2, color=color, linewidth=2.4, solid_capstyle="round")
+        panel.plot([c.ratio.estimate], [row - 0.12], "o", color=color, markersize=5.5)
+    panel.axvline(1.0, color=_INK, linewidth=0.8, zorder=0)
+    panel.set_yticks(range(len(comparisons)), [_versus(c) for c in comparisons], fontsize=8)
+    panel.set_ylim(len(comparisons) - 0.4, -0.6)
+    panel.set_xscale("log")
+    low, high = np.nanmin(span) / 1.05, np.nanmax(span) * 1.05
+    panel.set_xlim(low, high)
+    ticks = [t for t in (0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1, 1.1, 1.25, 1.5, 2, 3, 4, 6, 10) if low <= t <= high]
+    panel.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    panel.minorticks_off()
+    panel.set_xlabel("ratio of the distances until the map is complete (left of 1: shorter)", fontsize=9)
+    _plain(panel)
+    return figure
+
+
+def trajectory_figure(
+    policies: Sequence[PolicySpec],
+    plan: Any,
+    seed: int,
+    config: EnvConfig,
+    *,
+    make_env: MakeEnv = make_env,
+) -> Figure:
+    """The way of every policy on one plan from one start: the episodes are run again, as they were.
+
+    Raises:
+        ResultsError: an episode fails before it can be drawn.
+    """
+    from polyexplore_gym.rendering import draw
+
+    columns = min(len(policies), 4 if _wide(plan) < 1.6 else 2)
+    rows = -(-len(policies) // columns)
+    width = 3.6 if columns > 2 else 5.4
+    figure = _figure(width * columns, (width / _wide(plan) + 0.75) * rows)
+    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    env = make_env(config)
+    for panel, spec in zip(panels, policies, strict=False):
+        label = policy_label(spec)
+        snapshot, record = replay(env, spec, plan, seed, config)
+        draw(snapshot, panel, scale_bar=False, text=False)
+        ended = "" if record.complete else f", {record.status}"
+        panel.set_title(f"{label}: {record.distance:.0f} m, {record.measurements} scans{ended}", fontsize=9, color=_INK)
+    for panel in panels[len(policies) :]:
+        panel.set_axis_off()
+    env.close()
+    return figure
+
+
+def replay(env: Any, spec: PolicySpec, plan: Any, seed: int, config: EnvConfig) -> tuple[Any, EpisodeRecord]:
+    """The last snapshot of an episode that is run again, and its record; raises `ResultsError` if it fails."""
+    last: list[Any] = [None]
+
+    def observe(env: Any, info: Any, over: bool) -> None:
+        if over:
+            last[0] = env.unwrapped.snapshot()
+
+    record = run_episode(
+        env,
+        load_policy(spec),
+        plan,
+        seed,
+        label=policy_label(spec),
+        placement=config.exploration.placement,
+        drive=config.drive.mode,
+        observer=observe,
+    )
+    if last[0] is None:
+        raise ResultsError(f"{policy_label(spec)} on {plan.name} (seed {seed}): {record.error}")
+    return last[0], record
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure to a file of the format that the suffix names."""
+    try:
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror}") from error
+    return path
+
+
+def _figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingDependencyError('plots need matplotlib: pip install "polyexplore-gym[plots]"') from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _plain(panel: Any) -> None:
+    panel.grid(axis="x", color="#e3e3e3", linewidth=0.6)
+    panel.set_axisbelow(True)
+    panel.tick_params(labelsize=8, colors=_INK, length=2.5)
+    for side in ("top", "right"):
+        panel.spines[side].set_visible(False)
+
+
+def _style(index: int) -> tuple[str, Any]:
+    return _COLORS[index % len(_COLORS)], _DASHES[index % len(_DASHES)]
+
+
+def _versus(c: Comparison) -> str:
+    if c.ours[1] == c.theirs[1]:
+        return f"{c.ours[0]} / {c.theirs[0]}, {c.ours[1]}"
+    return f"{c.ours[1]} / {c.theirs[1]}, {c.ours[0]}"
+
+
+def _wide(plan: Any) -> float:
+    x0, y0, x1, y1 = plan.bounds
+    return float(np.clip((x1 - x0) / (y1 - y0), 0.4, 3.0))

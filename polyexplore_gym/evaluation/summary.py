@@ -1,0 +1,296 @@
+"""From records to figures: what each policy achieved, and how the policies compare.
+
+Failed and truncated episodes are counted, never averaged in: a policy that gives up early has driven
+little. Means, and everything that compares, use only the (plan, seed) pairs that all policies
+completed at that placement; how many those are is part of the result. A policy that completed
+nothing at a placement is left out of its comparison, so that it does not leave the others nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polyexplore_gym.errors import ResultsError
+from polyexplore_gym.evaluation.records import EpisodeRecord
+from polyexplore_gym.evaluation.statistics import (
+    Interval,
+    area_under_coverage,
+    bootstrap_interval,
+    geometric_mean,
+    holm,
+    interquartile_mean,
+    probability_of_improvement,
+    signed_rank_p,
+)
+
+Pair = tuple[str, int]
+"""Plan hash and seed: one start on one plan."""
+
+METRICS: dict[str, Callable[[EpisodeRecord], float | None]] = {
+    "distance": lambda r: r.distance,
+    "distance_90": lambda r: r.distance_90,
+    "distance_95": lambda r: r.distance_95,
+    "distance_99": lambda r: r.distance_99,
+    "measurements": lambda r: r.measurements,
+    "sim_time": lambda r: r.sim_time,
+    "collisions": lambda r: r.collisions,
+    "latency": lambda r: r.timing.get("act_mean"),
+}
+"""Figures of a record. `auc`, the area under the coverage, needs all records and is added to them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One figure of one policy over `pairs` starts."""
+
+    pairs: int
+    mean: Interval
+    iqm: Interval
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One policy at one placement."""
+
+    policy: str
+    placement: str
+    episodes: int
+    complete: int
+    truncated: int
+    failed: int
+    metrics: dict[str, Metric]
+    """By name; each over the pairs for which all compared policies have the figure."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One policy at one placement against another, over the pairs that both sides completed."""
+
+    ours: tuple[str, str]
+    """Policy and placement."""
+    theirs: tuple[str, str]
+    """Policy and placement."""
+    pairs: int
+    buildings: int
+    ratio: Interval
+    """Geometric mean of our distance over theirs; below 1 is better."""
+    improvement: Interval
+    """Probability that ours is the shorter on a pair, ties half."""
+    p: float
+    """Two-sided Wilcoxon signed-rank test on log distances, buildings averaged."""
+    p_holm: float
+    """The same, corrected for all comparisons made with it."""
+    ratios: tuple[float, ...]
+    """Our distance over theirs, pair by pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """All figures of a study."""
+
+    reference: str
+    rows: list[Row]
+    """By placement, the shortest mean distance first."""
+    against_reference: list[Comparison]
+    """Every other policy against the reference, at the same placement."""
+    between_placements: list[Comparison]
+    """Every policy at every further placement against itself at the first one."""
+    notes: list[str]
+    """What a reader must know of the figures: how many pairs were compared, what was left out."""
+
+
+def summarize(
+    records: Sequence[EpisodeRecord],
+    rng: np.random.Generator,
+    *,
+    reference: str = "nearest",
+    resamples: int = 5000,
+    confidence: float = 0.95,
+) -> Summary:
+    """The figures of a study's records.
+
+    The area under the coverage is the mean coverage over the plan's horizon: the longest of the
+    distances compared on that plan, all policies, placements and seeds together.
+
+    Args:
+        records: one an episode.
+        rng: source of the bootstrap.
+        reference: policy to compare with; when it was not run, the first of the records' is taken.
+        resamples: bootstrap samples.
+        confidence: content of the intervals.
+
+    Raises:
+        ResultsError: there are no records.
+    """
+    if not records:
+        raise ResultsError("there are no records to summarize")
+    policies = list(dict.fromkeys(r.policy for r in records))
+    placements = list(dict.fromkeys(r.placement for r in records))
+    if reference not in policies:
+        reference = policies[0]
+    by_key = {(r.policy, r.placement, (r.plan_hash, r.seed)): r for r in records}
+    table = _Table(by_key, rng, resamples, confidence)
+
+    rows: list[Row] = []
+    against: list[Comparison] = []
+    notes: list[str] = []
+    common: dict[str, list[Pair]] = {}
+    for placement in placements:
+        compared = [p for p in policies if table.completed(p, placement)]
+        common[placement] = _common_pairs(table.completed(p, placement) for p in compared)
+        notes += _notes(records, placement, policies, compared, len(common[placement]))
+    horizons = table.horizons(policies, common)
+    for placement in placements:
+        compared = [p for p in policies if table.completed(p, placement)]
+        found = table.rows(policies, compared, placement, common[placement], horizons)
+        rows += sorted(found, key=_sort_key)
+        others = [p for p in compared if p != reference]
+        if reference in compared:
+            sides = [((p, placement), (reference, placement)) for p in others]
+            against += table.compare(sides, [common[placement]] * len(sides))
+    between = []
+    for placement in placements[1:]:
+        sides = [((p, placement), (p, placements[0])) for p in policies]
+        pairs = [_common_pairs(table.completed(*side) for side in two) for two in sides]
+        kept = [i for i, p in enumerate(pairs) if p]
+        between += table.compare([sides[i] for i in kept], [pairs[i] for i in kept])
+    return Summary(reference, rows, against, between, notes)
+
+
+class _Table:
+    """Records by (policy, placement, pair), and the resampling that all figures share."""
+
+    def __init__(
+        self,
+        records: dict[tuple[str, str, Pair], EpisodeRecord],
+        rng: np.random.Generator,
+        resamples: int,
+        confidence: float,
+    ) -> None:
+        self._records = records
+        self._interval = functools.partial(bootstrap_interval, rng=rng, resamples=resamples, confidence=confidence)
+
+    def completed(self, policy: str, placement: str) -> list[Pair]:
+        return [
+            pair for (p, where, pair), r in self._records.items() if (p, where) == (policy, placement) and r.complete
+        ]
+
+    def horizons(self, policies: list[str], common: dict[str, list[Pair]]) -> dict[str, float]:
+        """By plan: the longest distance compared on it."""
+        longest: dict[str, float] = {}
+        for placement, pairs in common.items():
+            for policy in policies:
+                for pair in pairs:
+                    record = self._records.get((policy, placement, pair))
+                    if record is not None and record.complete:
+                        longest[pair[0]] = max(longest.get(pair[0], 0.0), record.distance)
+        return longest
+
+    def rows(
+        self,
+        policies: list[str],
+        compared: list[str],
+        placement: str,
+        pairs: list[Pair],
+        horizons: dict[str, float],
+    ) -> list[Row]:
+        metrics: dict[str, dict[str, Metric]] = {policy: {} for policy in policies}
+        get = {**METRICS, "auc": lambda r: _auc(r, horizons)}
+        for name, figure in get.items():
+            values = {(p, pair): figure(self._records[p, placement, pair]) for p in compared for pair in pairs}
+            kept = [pair for pair in pairs if all(values[p, pair] is not None for p in compared)]
+            for policy in compared:
+                metrics[policy][name] = self._metric(policy, placement, kept, [values[policy, pair] for pair in kept])
+        found = []
+        for policy in policies:
+            own = [r for (p, where, _), r in self._records.items() if (p, where) == (policy, placement)]
+            if own:
+                ended = Counter(r.status for r in own)
+                counts = ended["complete"], ended["truncated"], ended["failed"]
+                found.append(Row(policy, placement, len(own), *counts, metrics=metrics[policy]))
+        return found
+
+    def compare(
+        self, sides: list[tuple[tuple[str, str], tuple[str, str]]], pairs: list[list[Pair]]
+    ) -> list[Comparison]:
+        """Each (ours, theirs) over its pairs; the tests are corrected as one family."""
+        found = []
+        for (ours, theirs), both in zip(sides, pairs, strict=True):
+            a = np.array([self._records[(*ours, pair)].distance for pair in both])
+            b = np.array([self._records[(*theirs, pair)].distance for pair in both])
+            clusters, strata = self._buildings(*ours, both)
+            # All seen from the start: both drove nothing, a tie.
+            ratio = np.where((a > 0) & (b > 0), a, 1.0) / np.where((a > 0) & (b > 0), b, 1.0)
+            better = probability_of_improvement(a, b)
+            found.append(
+                Comparison(
+                    ours,
+                    theirs,
+                    len(both),
+                    len(set(clusters)),
+                    self._interval(ratio, clusters, strata, statistic=geometric_mean),
+                    self._interval(better, clusters, strata),
+                    signed_rank_p(np.log(ratio), clusters) if both else float("nan"),
+                    float("nan"),
+                    tuple(ratio.tolist()),
+                )
+            )
+        corrected = holm([c.p for c in found])
+        return [dataclasses.replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
+
+    def _metric(self, policy: str, placement: str, pairs: list[Pair], values: list[float | None]) -> Metric:
+        clusters, strata = self._buildings(policy, placement, pairs)
+        array = np.array(values, dtype=np.float64)
+        mean = self._interval(array, clusters, strata)
+        iqm = self._interval(array, clusters, strata, statistic=interquartile_mean)
+        return Metric(len(pairs), mean, iqm)
+
+    def _buildings(self, policy: str, placement: str, pairs: list[Pair]) -> tuple[list[str], list[str]]:
+        records = [self._records[policy, placement, pair] for pair in pairs]
+        return [r.group for r in records], [r.stratum for r in records]
+
+
+def _auc(record: EpisodeRecord, horizons: dict[str, float]) -> float:
+    distance, coverage = np.array(record.curve_distance), np.array(record.curve_coverage)
+    return area_under_coverage(distance, coverage, horizons[record.plan_hash])
+
+
+def _common_pairs(completed: Iterable[list[Pair]]) -> list[Pair]:
+    """Pairs that are in all lists, in the order of the first."""
+    lists = list(completed)
+    if not lists:
+        return []
+    others = [set(pairs) for pairs in lists[1:]]
+    return [pair for pair in lists[0] if all(pair in other for other in others)]
+
+
+def _sort_key(row: Row) -> tuple[bool, float]:
+    metric = row.metrics.get("distance")
+    return (metric is None or metric.pairs == 0, metric.mean.estimate if metric else 0.0)
+
+
+def _notes(
+    records: Sequence[EpisodeRecord], placement: str, policies: list[str], compared: list[str], common: int
+) -> list[str]:
+    pairs = {(r.plan_hash, r.seed) for r in records if r.placement == placement}
+    notes = [
+        f"{placement}: compared on {common} of {len(pairs)} starts, those completed by all {len(compared)} policies"
+    ]
+    left_out = [p for p in policies if p not in compared and any(r.policy == p for r in records)]
+    if left_out:
+        notes.append(f"{placement}: left out of the comparison, as nothing was completed: {', '.join(left_out)}")
+    errors = [r for r in records if r.placement == placement and r.status == "failed"]
+    for r in errors[:3]:
+        notes.append(f"{placement}: {r.policy} failed on {r.plan} (seed {r.seed}): {(r.error or '').splitlines()[0]}")
+    if len(errors) > 3:
+        notes.append(f"{placement}: {len(errors) - 3} more failed; see the field `error` of the records")
+    cut = sum(r.cut_nodes > 0 or r.cut_lines > 0 for r in records if r.placement == placement)
+    if cut:
+        notes.append(f"{placement}: in {cut} episodes the observation had no room for all nodes or lines at some time")
+    return notes

@@ -1,0 +1,188 @@
+"""The figures of a study as text, Markdown and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from polyexplore_gym.errors import ResultsError
+from polyexplore_gym.evaluation.statistics import Interval
+from polyexplore_gym.evaluation.summary import METRICS, Comparison, Row, Summary
+
+_FIGURES = ("distance", "IQM", "90%", "95%", "99%", "AUC", "scans", "time", "bumps", "ms")
+_HEADER = ("placement", "policy", "complete", *_FIGURES)
+_COMPARISON_HEADER = ("placement", "policy", "against", "pairs", "ratio", "P(shorter)", "p", "p Holm")
+LEGEND = """\
+distance: mean driven until the map was complete, m, with its 95 % interval; IQM: its interquartile mean; 90%, 95%,
+99%: mean driven until so much was seen, m; AUC: mean coverage over the longest distance compared on the plan; scans,
+time (s), bumps: means an episode; ms: mean decision. ratio: geometric mean of the distances' ratios, below 1 is
+shorter; P(shorter): probability of the shorter way on the same plan and start; p: Wilcoxon signed-rank test. A figure
+in brackets after a mean: it stands on so many starts only."""
+
+
+def summary_text(summary: Summary, style: str = "text") -> str:
+    """All tables of a summary, `style` "text" (aligned columns) or "markdown"."""
+    parts = [format_table(_HEADER, [_row(row) for row in summary.rows], style)]
+    if summary.against_reference:
+        lines = [_comparison(c, c.ours[1], c.ours[0], c.theirs[0]) for c in summary.against_reference]
+        parts.append(format_table(_COMPARISON_HEADER, lines, style))
+    if summary.between_placements:
+        lines = [_comparison(c, c.ours[1], c.ours[0], c.theirs[1]) for c in summary.between_placements]
+        parts.append(format_table(_COMPARISON_HEADER, lines, style))
+    bullet = "- " if style == "markdown" else ""
+    parts.append("\n".join(bullet + note for note in summary.notes))
+    parts.append(LEGEND)
+    return "\n\n".join(parts) + "\n"
+
+
+def write_tables(summary: Summary, folder: Path) -> list[Path]:
+    """Write `summary.txt`, `summary.md`, `summary.csv` and `comparisons.csv`; returns their paths."""
+    files = {
+        "summary.txt": summary_text(summary),
+        "summary.md": summary_text(summary, "markdown"),
+        "summary.csv": summary_csv(summary),
+        "comparisons.csv": comparisons_csv(summary),
+    }
+    try:
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ResultsError(f"{folder}: tables cannot be written: {error.strerror}") from error
+    return [folder / name for name in files]
+
+
+def summary_csv(summary: Summary) -> str:
+    """Every figure of every row, with its interval, one row a policy and placement."""
+    names = [*METRICS, "auc"]
+    header = ["policy", "placement", "episodes", "complete", "truncated", "failed"]
+    for name in names:
+        header += [
+            f"{name}_{part}" for part in ("pairs", "mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high")
+        ]
+    lines: list[list[object]] = []
+    for row in summary.rows:
+        line: list[object] = [row.policy, row.placement, row.episodes, row.complete, row.truncated, row.failed]
+        for name in names:
+            metric = row.metrics.get(name)
+            line += [metric.pairs, *_cells(metric.mean), *_cells(metric.iqm)] if metric else [0] + [""] * 6
+        lines.append(line)
+    return _csv(header, lines)
+
+
+def comparisons_csv(summary: Summary) -> str:
+    """Every comparison, one a row."""
+    header = ["policy", "placement", "against_policy", "against_placement", "pairs", "buildings"]
+    header += ["ratio", "ratio_low", "ratio_high", "p_shorter", "p_shorter_low", "p_shorter_high", "p", "p_holm"]
+    lines = [
+        [
+            *c.ours,
+            *c.theirs,
+            c.pairs,
+            c.buildings,
+            *_cells(c.ratio),
+            *_cells(c.improvement),
+            _cell(c.p),
+            _cell(c.p_holm),
+        ]
+        for c in [*summary.against_reference, *summary.between_placements]
+    ]
+    return _csv(header, lines)
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]], style: str = "text") -> str:
+    """Columns as wide as their widest cell; text to the left, figures (any column but text) to the right."""
+    cells = [list(map(str, row)) for row in rows]
+    widths = [max(len(row[i]) for row in [list(header), *cells]) for i in range(len(header))]
+    left = [all(not _figure(row[i]) for row in cells) for i in range(len(header))]
+    aligned = [
+        [cell.ljust(w) if to_left else cell.rjust(w) for cell, w, to_left in zip(row, widths, left, strict=True)]
+        for row in [list(header), *cells]
+    ]
+    if style == "markdown":
+        rule = ["-" * w if to_left else "-" * (w - 1) + ":" for w, to_left in zip(widths, left, strict=True)]
+        return "\n".join(f"| {' | '.join(row)} |" for row in [aligned[0], rule, *aligned[1:]])
+    rule = ["-" * w for w in widths]
+    return "\n".join("  ".join(row).rstrip() for row in [aligned[0], rule, *aligned[1:]])
+
+
+def _row(row: Row) -> list[str]:
+    def mean(name: str, digits: int, factor: float = 1.0) -> str:
+        metric = row.metrics.get(name)
+        if metric is None or metric.pairs == 0:
+            return "-"
+        text = _number(metric.mean.estimate * factor, digits)
+        return text if metric.pairs == compared else f"{text} ({metric.pairs})"
+
+    distance = row.metrics.get("distance")
+    compared = distance.pairs if distance else 0
+    return [
+        row.placement,
+        row.policy,
+        _counts(row),
+        _interval(distance.mean, 1) if distance and compared else "-",
+        _number(distance.iqm.estimate, 1) if distance and compared else "-",
+        mean("distance_90", 1),
+        mean("distance_95", 1),
+        mean("distance_99", 1),
+        mean("auc", 3),
+        mean("measurements", 1),
+        mean("sim_time", 0),
+        mean("collisions", 2),
+        mean("latency", 2, 1000.0),
+    ]
+
+
+def _counts(row: Row) -> str:
+    text = f"{row.complete}/{row.episodes}"
+    extra = [f"{n} {word}" for n, word in ((row.truncated, "cut off"), (row.failed, "failed")) if n]
+    return f"{text} ({', '.join(extra)})" if extra else text
+
+
+def _comparison(c: Comparison, placement: str, policy: str, against: str) -> list[str]:
+    return [
+        placement,
+        policy,
+        against,
+        str(c.pairs),
+        _interval(c.ratio, 3) if c.pairs else "-",
+        _interval(c.improvement, 2) if c.pairs else "-",
+        _p(c.p),
+        _p(c.p_holm),
+    ]
+
+
+def _interval(value: Interval, digits: int) -> str:
+    if math.isnan(value.low):
+        return _number(value.estimate, digits)
+    return f"{value.estimate:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
+
+
+def _number(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _p(value: float) -> str:
+    return "-" if math.isnan(value) else ("<0.001" if value < 0.001 else f"{value:.3f}")
+
+
+def _figure(cell: str) -> bool:
+    return cell[:1].isdigit() or cell[:1] in "<-"
+
+
+def _cells(value: Interval) -> list[str]:
+    return [_cell(value.estimate), _cell(value.low), _cell(value.high)]
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"
+
+
+def _csv(header: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(lines)
+    return text.getvalue()
