@@ -17,7 +17,7 @@ from polyexplore_gym.sim.robot import nearest_wall
 
 X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, DISTANCE = range(9)
 """The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
-motion lost to a wall (m, forgotten over some steps), distance driven (m)."""
+motion lost to a wall (m, see `forget`), distance driven (m)."""
 FOLLOW, ALIGN, FINAL, DONE, LOST = range(5)
 """The phases: drive along the leg, turn on the spot towards it, turn to the final heading, arrived, off the path."""
 
@@ -29,7 +29,9 @@ _LOST = 0.5
 _LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.08, 0.35, 0.3
 _MARGIN = 0.9
 """Share of the acceleration limits that is planned with; the rest is for corrections."""
-_REST_RATE = 0.2
+_GRAZING = math.tan(math.radians(15.0)) ** 2
+_LAST_LEG = 0.5
+"""A last leg shorter than this (m) leaves no room to settle on it: the robot stops and turns before it."""
 
 
 @njit(cache=True)
@@ -59,7 +61,7 @@ def vertex_speeds(path, max_speed, acceleration, turn_acceleration):  # type: ig
             )
             if turn < 1e-6:
                 out[k] = max_speed
-            elif turn < _SHARP:
+            elif turn < (0.05 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
                 length = min(8.0 * _CUT / turn, ahead, behind)
                 out[k] = min(max_speed, 0.5 * length * math.sqrt(0.6 * turn_acceleration / turn))
         out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * acceleration * ahead))
@@ -86,8 +88,7 @@ def _rotate(state, error, limits, step):  # type: ignore[no-untyped-def]
     """Turn on the spot: brake, then turn by error. Returns whether it is done."""
     rate, acceleration, turn_acceleration = limits[1], limits[2], limits[3]
     state[SPEED] = _towards(state[SPEED], 0.0, acceleration * step)
-    if abs(error) <= _HEADING_TOLERANCE and abs(state[RATE]) <= _REST_RATE and state[SPEED] == 0.0:
-        state[RATE] = 0.0
+    if abs(error) <= _HEADING_TOLERANCE and abs(state[RATE]) <= turn_acceleration * step and state[SPEED] == 0.0:
         return True
     wish = min(rate, _braking(abs(error), 0.0, _MARGIN * turn_acceleration, step))
     state[RATE] = _towards(state[RATE], math.copysign(wish, error), turn_acceleration * step)
@@ -141,7 +142,7 @@ def command(state, path, speeds, heading, final_turn, limits, track, step):  # t
             return
         if state[PHASE] == ALIGN:
             # towards the end of the leg from here; too close to it, along the leg
-            aim = math.atan2(dy, dx) if left < 0.1 else math.atan2(path[leg + 1, 1] - y, path[leg + 1, 0] - x)
+            aim = math.atan2(dy, dx) if left < 0.03 else math.atan2(path[leg + 1, 1] - y, path[leg + 1, 0] - x)
             if not _rotate(state, _wrap(aim - phi), limits, step):
                 return
             state[PHASE] = FOLLOW
@@ -171,6 +172,16 @@ def command(state, path, speeds, heading, final_turn, limits, track, step):  # t
 
 
 @njit(cache=True)
+def forget(state, progress):  # type: ignore[no-untyped-def]
+    """Reduce the motion lost to a wall by a share of the progress (m) made.
+
+    Sliding along a wall at the angle a loses tan(a)^2 of the progress, so that grazing below about 15 degrees never
+    adds up to a bump, at any speed.
+    """
+    state[DEFICIT] = max(0.0, state[DEFICIT] - _GRAZING * max(progress, 0.0))
+
+
+@njit(cache=True)
 def run_free(state, path, speeds, heading, final_turn, limits, track, step, walls, radius, trajectory):  # type: ignore[no-untyped-def]
     """Follow the path as long as no wall is in reach: what a physics engine without contacts would integrate.
 
@@ -193,6 +204,6 @@ def run_free(state, path, speeds, heading, final_turn, limits, track, step, wall
         state[DISTANCE] += state[SPEED] * step
         state[X], state[Y] = x, y
         state[HEADING] = _wrap(state[HEADING] + state[RATE] * step)
-        state[DEFICIT] *= 0.9
+        forget(state, state[SPEED] * step)
         trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = x, y, state[HEADING]
     return trajectory.shape[0], False

@@ -152,6 +152,7 @@ class World:
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
         speeds = follower.vertex_speeds(path, robot.max_speed, robot.max_acceleration, robot.max_turn_acceleration)
         steps = max(1, math.ceil(self.config.time_limit / step))
+        engine: _Engine | None = None
         parts, done, collided = [self._pose[None].copy()], 0, False
         while done < steps:
             rows = np.empty((min(_ROWS, steps - done), 3))
@@ -163,10 +164,10 @@ class World:
             if state[follower.PHASE] >= follower.DONE:
                 break
             if contact:
-                if self._engine is None:
-                    self._engine = _Engine(robot)
-                self._engine.add_walls(self._walls, near)
-                self._engine.step(state, step)
+                if engine is None:
+                    engine = self._engine = self._engine or _Engine(robot)
+                    engine.begin(self._walls, near)
+                engine.step(state, step)
                 parts.append(state[None, :3].copy())
                 done += 1
                 if state[follower.DEFICIT] > _BUMP:
@@ -198,15 +199,18 @@ class _Engine:
     def __init__(self, robot: RobotConfig) -> None:
         self._space = pymunk.Space()
         self._space.collision_slop = 1e-4
-        self._space.collision_bias = 1e-10
+        self._space.collision_bias = 0.0
         self._body = pymunk.Body(robot.mass, pymunk.moment_for_circle(robot.mass, 0.0, robot.radius))
         shape = pymunk.Circle(self._body, robot.radius)
         shape.friction = 0.0
         self._space.add(self._body, shape)
         self._radius = robot.radius
         self._added: set[int] = set()
+        self._stands: tuple[float, float] | None = None
 
-    def add_walls(self, walls: np.ndarray, near: np.ndarray) -> None:
+    def begin(self, walls: np.ndarray, near: np.ndarray) -> None:
+        """Start a drive from standstill among the walls of these rows."""
+        self._stands = None
         new = [int(k) for k in near if int(k) not in self._added]
         if new:
             static = self._space.static_body
@@ -216,19 +220,26 @@ class _Engine:
     def step(self, state: np.ndarray, step: float) -> None:
         """One time step at the commanded velocity (wheels do not slip on command), contacts resolved."""
         body = self._body
-        speed, heading = state[follower.SPEED], state[follower.HEADING]
+        speed, heading, rate = float(state[follower.SPEED]), float(state[follower.HEADING]), float(state[follower.RATE])
         c, s = math.cos(heading), math.sin(heading)
-        x, y = float(state[0]), float(state[1])
-        body.position, body.angle = (x, y), float(heading)
-        count = max(1, math.ceil(speed * step / (_SUBSTEP * self._radius)))
+        x, y = float(state[follower.X]), float(state[follower.Y])
+        if (x, y) != self._stands:  # it came here freely; else it still has the velocity the contact left it
+            body.position, body.velocity = (x, y), (speed * c, speed * s)
+        body.angle, body.angular_velocity = heading, rate
+        fastest = max(speed, body.velocity.length)
+        count = max(1, math.ceil(fastest * step / (_SUBSTEP * self._radius)))
+        push = body.mass * count / step
         for _ in range(count):
-            # the drive keeps pushing: what the wall took of the velocity is commanded again
-            body.velocity, body.angular_velocity = (speed * c, speed * s), float(state[follower.RATE])
+            vx, vy = body.velocity
+            body.force = push * (speed * c - vx), push * (speed * s - vy)  # the wheels, against what the wall takes
             self._space.step(step / count)
         end = body.position
+        self._stands = (end.x, end.y)
         dx, dy = end.x - x, end.y - y
         achieved = dx * c + dy * s
-        state[follower.DEFICIT] = 0.9 * state[follower.DEFICIT] + speed * step - achieved
+        state[follower.DEFICIT] += speed * step - achieved
         state[follower.DISTANCE] += math.hypot(dx, dy)
         state[follower.SPEED] = max(0.0, achieved / step)
-        state[0], state[1], state[2] = end.x, end.y, wrap(body.angle)
+        state[follower.X], state[follower.Y] = end.x, end.y
+        state[follower.HEADING] = wrap(heading + rate * step)
+        follower.forget(state, achieved)
