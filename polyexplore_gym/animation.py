@@ -76,7 +76,8 @@ def save_animation(frames: Iterable[np.ndarray], path: str | Path, fps: float = 
 class Window:
     """A window on the screen that shows frames as they come (pygame, imported when first shown).
 
-    Raises `MissingDependencyError` on the first `show` if pygame is not installed.
+    The first `show` raises `MissingDependencyError` if pygame is not installed, `RenderingError` if
+    there is no screen.
     """
 
     def __init__(self, title: str = "polyexplore", fps: float | None = None) -> None:
@@ -95,8 +96,11 @@ class Window:
         pygame = require("pygame", "window")
         size = (picture.shape[1], picture.shape[0])
         if self._screen is None or self._screen.get_size() != size:
-            pygame.display.init()
-            self._screen = pygame.display.set_mode(size)
+            try:
+                pygame.display.init()
+                self._screen = pygame.display.set_mode(size)
+            except pygame.error as error:
+                raise RenderingError(f"no screen for a window ({error}): use rgb_array, or save a film") from error
             pygame.display.set_caption(self.title)
             self._clock = pygame.time.Clock()
         self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(picture).tobytes(), size, "RGB"), (0, 0))
@@ -159,6 +163,7 @@ def _save_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, hold: float)
 def _save_gif(frames: Iterator[np.ndarray], path: Path, fps: float, hold: float) -> None:
     require("PIL", "plots")
     from PIL import Image
+    from scipy.spatial import cKDTree
 
     kept, shape = [], (0, 0, 3)
     for picture in frames:
@@ -170,11 +175,45 @@ def _save_gif(frames: Iterator[np.ndarray], path: Path, fps: float, hold: float)
 
     # One palette for all frames, or areas at rest would flicker and nothing could be left out between frames.
     sample = np.unique(np.linspace(0, len(kept) - 1, 8).round().astype(int))
-    palette = Image.fromarray(np.concatenate([picture_at(i) for i in sample])).quantize(255, dither=Image.Dither.NONE)
-    images = (
-        Image.fromarray(picture_at(i)).quantize(palette=palette, dither=Image.Dither.NONE) for i in range(len(kept))
-    )
+    palette = _palette(np.concatenate([picture_at(i).reshape(-1, 3) for i in sample]))
+    nearest = cKDTree(palette)
+    index = np.full(1 << 24, -1, dtype=np.int16)  # of every colour met so far
+
+    def indexed(picture: np.ndarray) -> Image.Image:
+        packed = _packed(picture)
+        new = np.unique(packed[index[packed] < 0])
+        index[new] = nearest.query(_unpacked(new))[1]
+        image = Image.fromarray(index[packed].astype(np.uint8))
+        image.putpalette(palette.tobytes())
+        return image
+
+    images = (indexed(picture_at(i)) for i in range(len(kept)))
     first = next(images)
     durations = [1000.0 / fps] * len(kept)
     durations[-1] += 1000.0 * hold
     first.save(path, save_all=True, append_images=images, duration=durations, loop=0, optimize=True)
+
+
+def _palette(pixels: np.ndarray) -> np.ndarray:
+    """(k, 3) uint8, at most 255: the commonest colours of pixels (n, 3) exactly, the rest by median cut.
+
+    Median cut alone shifts flat areas: a white page turns grey.
+    """
+    from PIL import Image
+
+    colors, counts = np.unique(_packed(pixels), return_counts=True)
+    colors = colors[np.argsort(-counts, kind="stable")]
+    if len(colors) <= 255:
+        return _unpacked(colors)
+    rest = Image.fromarray(_unpacked(colors[96:])[None]).quantize(159, dither=Image.Dither.NONE)
+    mixed = np.array(rest.getpalette(), dtype=np.uint8).reshape(-1, 3)
+    return np.concatenate([_unpacked(colors[:96]), mixed])
+
+
+def _packed(pixels: np.ndarray) -> np.ndarray:
+    red, green, blue = np.moveaxis(pixels.astype(np.int32), -1, 0)
+    return red << 16 | green << 8 | blue
+
+
+def _unpacked(colors: np.ndarray) -> np.ndarray:
+    return np.stack([colors >> 16, colors >> 8 & 255, colors & 255], axis=1).astype(np.uint8)

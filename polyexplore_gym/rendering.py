@@ -41,7 +41,7 @@ _INK = "#333333"
 # Figure layout in points (1/72 inch): room above, below and beside the map, height of a legend row.
 _TOP, _BOTTOM, _SIDE, _ROW = 22.0, 20.0, 8.0, 13.0
 _BADGE = 5.6
-"""Radius of the circle that carries a node's number, points."""
+"""Radius of the circle that carries a node's number, points (about: it varies a little with the scale)."""
 _MIN_INCHES = 8.0
 """Figures of 800 pixels or more are this wide and only gain resolution; smaller ones get smaller."""
 
@@ -103,14 +103,14 @@ def draw(
     lines([snapshot.trajectory[:, :2]], _WAY, 1.5, 5.1)
     if len(snapshot.path) >= 2:
         dashes: dict[str, Any] = {"linewidth": 1.3 * thick, "linestyle": (0, (2.5, 1.8))}
-        ax.add_artist(Line2D(*snapshot.path[:, :2].T, color=_JUMP, zorder=5.2, **dashes))
+        ax.add_artist(Line2D(*snapshot.path[:, :2].T, color=_JUMP, zorder=4.9, **dashes))
     spots: dict[str, Any] = {"marker": "o", "markersize": 4.4 * thick, "markeredgewidth": 0.7 * thick}
     ax.add_artist(
         Line2D(*snapshot.measured_at[:, :2].T, linestyle="", color=_WAY, markeredgecolor="white", zorder=5.3, **spots)
     )
     lines(snapshot.jump_edges, _JUMP, 2.6, 6.0)
     _draw_robot(snapshot, ax, point)
-    _draw_nodes(snapshot, ax, point)
+    _draw_nodes(snapshot, ax, point, thick)
     if text:
         _draw_text(snapshot, ax)
     if scale_bar:
@@ -269,11 +269,16 @@ def _fan(scan: np.ndarray, pose: np.ndarray | None) -> np.ndarray:
     return scan if between < 3 * 2 * np.pi / len(scan) else np.concatenate([pose[None, :2], scan])
 
 
+def _robot_radius(snapshot: Snapshot, point: float) -> float:
+    """True to scale, but never so small that it is lost on a large plan, m."""
+    return max(snapshot.radius, 4.2 * point)
+
+
 def _draw_robot(snapshot: Snapshot, ax: Axes, point: float) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    radius = max(snapshot.radius, 4.2 * point)  # to be seen on the largest plans too
+    radius = _robot_radius(snapshot, point)
     x, y, heading = (float(value) for value in snapshot.pose)
     if snapshot.estimate is not None and not np.allclose(snapshot.estimate, snapshot.pose, atol=0.005):
         u, v, believed = (float(value) for value in snapshot.estimate)
@@ -286,7 +291,7 @@ def _draw_robot(snapshot: Snapshot, ax: Axes, point: float) -> None:
     ax.add_artist(Line2D([x, tip[0]], [y, tip[1]], color="white", linewidth=1.6, solid_capstyle="butt", zorder=7.2))
 
 
-def _draw_nodes(snapshot: Snapshot, ax: Axes, point: float) -> None:
+def _draw_nodes(snapshot: Snapshot, ax: Axes, point: float, thick: float) -> None:
     """Numbered badges that point in the node's heading; in a crowd they step aside and keep a thread to the node."""
     from matplotlib.collections import LineCollection, PathCollection
     from matplotlib.path import Path as Outline
@@ -298,13 +303,16 @@ def _draw_nodes(snapshot: Snapshot, ax: Axes, point: float) -> None:
     ids = np.arange(len(positions))
     free = snapshot.node_mask.astype(bool)
     lit = ids == (-1 if snapshot.chosen is None else snapshot.chosen)
-    badges = _apart(positions / point, 2 * _BADGE + 1.0) * point
+    size = float(np.clip(1.25 * thick, 0.95, 1.3))
+    radius = _BADGE * size
+    robot = _robot_radius(snapshot, point) / point
+    badges = _apart(positions / point, 2 * radius + 1.0, snapshot.pose[:2] / point, robot + radius + 1.0) * point
     moved = np.hypot(*(badges - positions).T) > 0.5 * point
     color = np.where(lit | free, _JUMP, _MASKED)
     threads = np.stack([positions, badges], axis=1)[moved]
     ax.add_collection(LineCollection(threads, colors=color[moved], linewidths=0.7, zorder=8), autolim=False)
 
-    in_points = Affine2D().scale(1.0 / 72.0) + _root(ax).dpi_scale_trans
+    in_points = Affine2D().scale(size / 72.0) + _root(ax).dpi_scale_trans
 
     def stamp(shapes: list[Outline], rows: np.ndarray, zorder: float, **style: Any) -> None:
         at = badges[rows]
@@ -313,7 +321,7 @@ def _draw_nodes(snapshot: Snapshot, ax: Axes, point: float) -> None:
         ax.add_collection(stamps, autolim=False)
 
     circle = Outline.unit_circle().transformed(Affine2D().scale(_BADGE))
-    tip = np.array([[0.75, 0.66], [1.75, 0.0], [0.75, -0.66], [0.75, 0.66]]) * _BADGE
+    tip = np.array([[0.8, 0.56], [1.7, 0.0], [0.8, -0.56], [0.8, 0.56]]) * _BADGE
     looks = (
         (~free & ~lit, {"facecolors": "#f4f4f4", "edgecolors": _MASKED, "linewidths": 0.9}, _MASKED, _MASKED),
         (free & ~lit, {"facecolors": "white", "edgecolors": _JUMP, "linewidths": 1.2}, _JUMP, _INK),
@@ -324,7 +332,7 @@ def _draw_nodes(snapshot: Snapshot, ax: Axes, point: float) -> None:
             continue
         z = 8.1 + 0.1 * rank
         if rows is lit:
-            glow = Outline.unit_circle().transformed(Affine2D().scale(_BADGE + 4.0))
+            glow = Outline.unit_circle().transformed(Affine2D().scale(1.6 * _BADGE))
             stamp([glow], rows, z, facecolors=_GLOW, alpha=0.85, linewidths=0)
         tips = [Outline(tip).transformed(Affine2D().rotate(heading)) for heading in snapshot.node_headings[rows]]
         stamp(tips, rows, z + 0.01, facecolors=pointer, linewidths=0)
@@ -345,27 +353,34 @@ def _number(number: int, bold: bool) -> Outline:
     return Outline(glyphs.vertices - (low + high) / 2, glyphs.codes)
 
 
-def _apart(centres: np.ndarray, distance: float) -> np.ndarray:
-    """Push points apart until neighbours are `distance` from each other, or nearly so in a crowd."""
+def _apart(centres: np.ndarray, distance: float, keep_off: np.ndarray, keep_off_distance: float) -> np.ndarray:
+    """Push points apart until neighbours are `distance` from each other, or nearly so in a crowd.
+
+    None stays within `keep_off_distance` of the point `keep_off` (2,), the robot.
+    """
     placed = centres.astype(np.float64).copy()
     turn = np.arange(len(placed)) * 2.399963  # golden angle: points on one spot leave in different directions
-    spread = 0.01 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    placed += 1e-3 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
     for _ in range(60):
         away = placed[:, None] - placed[None]
         gap = np.hypot(away[..., 0], away[..., 1])
         np.fill_diagonal(gap, np.inf)
-        if gap.min() >= distance - 0.05:
+        gap = np.maximum(gap, 1e-9)
+        from_robot = placed - keep_off
+        far = np.maximum(np.hypot(from_robot[:, 0], from_robot[:, 1]), 1e-9)
+        if gap.min() >= distance - 0.05 and far.min() >= keep_off_distance - 0.05:
             break
-        if gap.min() < 1e-6:
-            placed += spread
-            continue
         push = np.clip(distance - gap, 0.0, None) / (2.0 * gap)
         placed += (push[..., None] * away).sum(axis=1)
+        placed += (np.clip(keep_off_distance - far, 0.0, None) / far)[:, None] * from_robot
     return placed
 
 
 def _draw_text(snapshot: Snapshot, ax: Axes) -> None:
-    below = [f"{snapshot.distance:.1f} m driven", f"{snapshot.measurements} measurements"]
+    below = [
+        f"{snapshot.distance:.1f} m driven",
+        f"{snapshot.measurements} measurement{'s' * (snapshot.measurements != 1)}",
+    ]
     if snapshot.coverage is not None:
         below.append(f"{100 * snapshot.coverage:.0f} % seen")
     if len(snapshot.node_positions):
@@ -383,7 +398,7 @@ def _draw_scale_bar(ax: Axes) -> None:
     inches = _root(ax).dpi_scale_trans
     down = transform + ScaledTranslation(0, -10 / 72.0, inches)
     lengths = np.array([1, 2, 5, 10, 20, 50, 100])
-    length = lengths[np.searchsorted(lengths, 0.16 * (x1 - x0), side="right") - 1] if x1 - x0 > 6 else 1
+    length = lengths[np.searchsorted(lengths, 0.18 * (x1 - x0), side="right") - 1] if x1 - x0 > 6 else 1
     end = x1 - 0.004 * (x1 - x0)
     bar: dict[str, Any] = {"color": _INK, "transform": down, "clip_on": False, "zorder": 9}
     ax.add_artist(

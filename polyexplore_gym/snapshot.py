@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from polyexplore_gym.errors import RenderingError
+
 Polygon = tuple[np.ndarray, tuple[np.ndarray, ...]]
 """Exterior (n, 2) and holes, each (k, 2); rings are not closed."""
 
@@ -20,6 +22,8 @@ class Snapshot:
 
     Metres and radians throughout. Whoever takes a snapshot hands over arrays that do not change
     afterwards (copies), since an animation may keep many of them.
+
+    Raises `RenderingError` if arrays that belong together differ in length, or `chosen` is no row.
     """
 
     exterior: np.ndarray
@@ -41,7 +45,7 @@ class Snapshot:
     node_mask: np.ndarray = field(default_factory=lambda: _empty(0, dtype=bool))
     """(N,) bool: the node can be reached."""
     chosen: int | None = None
-    """Row of the node that was chosen."""
+    """Row of the node that was chosen among those shown here."""
     trajectory: np.ndarray = field(default_factory=lambda: _empty(0, 2))
     """(m, 2) or (m, 3): the way driven so far, true positions."""
     measured_at: np.ndarray = field(default_factory=lambda: _empty(0, 2))
@@ -66,3 +70,13 @@ class Snapshot:
     """Measurements taken so far."""
     title: str = ""
     """Shown above the map, such as the plan's name."""
+
+    def __post_init__(self) -> None:
+        rows = len(self.node_positions)
+        for name, length in (("wall_fitted", len(self.walls)), ("node_headings", rows), ("node_mask", rows)):
+            if len(getattr(self, name)) != length:
+                raise RenderingError(f"Snapshot.{name} has {len(getattr(self, name))} rows, expected {length}")
+        if self.chosen is not None and not 0 <= self.chosen < rows:
+            raise RenderingError(f"Snapshot.chosen = {self.chosen}: there are {rows} nodes")
+        if self.exterior.ndim != 2 or self.exterior.shape[1] != 2 or len(self.exterior) < 3:
+            raise RenderingError(f"Snapshot.exterior has shape {self.exterior.shape}, expected (n, 2) with n >= 3")
