@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from polyexplore_gym.snapshot import Snapshot
 
 
-def motion(before: Snapshot, after: Snapshot, step: float = 0.25) -> Iterator[Snapshot]:
-    """The drive between two snapshots, for animations that flow: the robot moves on, the map waits.
+def motion(before: Snapshot, after: Snapshot, chosen: int | None = None, step: float = 0.25) -> Iterator[Snapshot]:
+    """One decision as an animation that flows, from the snapshots before and after `env.step(chosen)`.
 
-    Yields `before` with the robot at every `step` metres along what `after.trajectory` adds;
-    neither `before` nor `after` itself.
+    Yields `before` with the chosen node lit and the planned path, then the robot at every `step`
+    metres along what `after.trajectory` adds, while the map waits; `after` itself is not yielded.
     """
+    before = replace(before, chosen=before.chosen if chosen is None else chosen, path=after.path)
+    yield before
     new = after.trajectory[max(len(before.trajectory) - 1, 0) :]
     if len(new) < 2:
         return

@@ -344,10 +344,14 @@ def test_animation_refuses_other_formats(tmp_path: Path) -> None:
         rendering.save_animation(walk(1), tmp_path / "film.avi")
 
 
-def test_motion_follows_the_new_part_of_the_way() -> None:
-    before = busy()
-    after = busy(trajectory=np.array([[1.0, 1.0], [2.0, 1.5], [2.0, 2.0], [2.0, 4.0], [5.0, 4.0]]), distance=17.34)
-    between = list(rendering.motion(before, after, step=0.5))
+def test_motion_lights_the_choice_and_follows_the_new_part_of_the_way() -> None:
+    before = busy(chosen=None)
+    way = np.array([[1.0, 1.0], [2.0, 1.5], [2.0, 2.0], [2.0, 4.0], [5.0, 4.0]])
+    after = busy(trajectory=way, path=way[2:], distance=17.34)
+    first, *between = rendering.motion(before, after, chosen=1, step=0.5)
+    assert np.array_equal(first.pose, before.pose)
+    assert first.scan is not None
+    assert all(s.chosen == 1 and s.path is after.path for s in (first, *between))
     assert len(between) == 9  # 5 m of way without its two ends
     positions = np.array([s.pose[:2] for s in between])
     assert np.allclose(positions[:3], [[2.0, 2.5], [2.0, 3.0], [2.0, 3.5]])
@@ -356,16 +360,15 @@ def test_motion_follows_the_new_part_of_the_way() -> None:
     assert between[-1].pose[2] == pytest.approx(0.0)
     assert between[-1].distance == pytest.approx(12.34 + 4.5)
     assert np.allclose(between[-1].trajectory[-2:], [[2.0, 4.0], [4.5, 4.0]])
-    assert all(s.chosen == before.chosen for s in between)
-    assert list(rendering.motion(before, before)) == []
 
 
 def test_motion_takes_given_headings_and_standing_still() -> None:
     before = busy(trajectory=np.array([[1.0, 1.0, 0.0]]))
     turn = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0], [2.0, 1.0, 0.3]])
-    between = list(rendering.motion(before, busy(trajectory=turn), step=0.25))
+    _, *between = rendering.motion(before, busy(trajectory=turn), step=0.25)
     assert [s.pose[2] for s in between] == pytest.approx([0.3] * 3)
     assert all(np.isfinite(s.pose).all() for s in between)
+    assert len(list(rendering.motion(before, before))) == 1
 
 
 def test_window_shows_and_closes(monkeypatch: pytest.MonkeyPatch) -> None:
