@@ -173,7 +173,7 @@ def grid_points(segments, spacing):  # type: ignore[no-untyped-def]
     inside = np.zeros((rows, columns), np.bool_)
     for k in range(segments.shape[0]):
         ax, ay, bx, by = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
-        low = max(int(math.ceil((min(ay, by) - y0) / spacing - 0.5)), 0)
+        low = max(math.ceil((min(ay, by) - y0) / spacing - 0.5), 0)
         for r in range(low, rows):
             y = y0 + (r + 0.5) * spacing
             if y >= max(ay, by):
@@ -182,7 +182,7 @@ def grid_points(segments, spacing):  # type: ignore[no-untyped-def]
                 continue
             # Everything to the right of the crossing changes side.
             x = ax + (y - ay) / (by - ay) * (bx - ax)
-            first = max(int(math.ceil((x - x0) / spacing - 0.5)), 0)
+            first = max(math.ceil((x - x0) / spacing - 0.5), 0)
             for c in range(first, columns):
                 inside[r, c] = not inside[r, c]
     found = np.argwhere(inside)

@@ -15,9 +15,9 @@ from numba import njit
 
 from polyexplore_gym.sim.robot import nearest_wall
 
-X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, DISTANCE = range(9)
-"""The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
-motion lost to a wall (m, see `forget`), distance driven (m)."""
+X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT = range(8)
+"""The state, float64 (8,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase, and
+motion lost to a wall (m, see `forget`)."""
 FOLLOW, ALIGN, FINAL, DONE, LOST = range(5)
 """The phases: drive along the leg, turn on the spot towards it, turn to the final heading, arrived, off the path."""
 
@@ -61,7 +61,7 @@ def vertex_speeds(path, max_speed, acceleration, turn_acceleration):  # type: ig
             )
             if turn < 1e-6:
                 out[k] = max_speed
-            elif turn < (0.05 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
+            elif turn < (0.005 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
                 length = min(8.0 * _CUT / turn, ahead, behind)
                 out[k] = min(max_speed, 0.5 * length * math.sqrt(0.6 * turn_acceleration / turn))
         out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * acceleration * ahead))
@@ -189,7 +189,7 @@ def run_free(state, path, speeds, heading, final_turn, limits, track, step, wall
     True the command for the next step is set but not executed, for that step would run into a wall.
     Motion along a wall or away from it is free even while the disc touches it.
     """
-    clearance = nearest_wall(walls, state[X], state[Y])[0] - radius
+    clear = nearest_wall(walls, state[X], state[Y])[0] - radius  # at least so far to the nearest wall
     for row in range(trajectory.shape[0]):
         command(state, path, speeds, heading, final_turn, limits, track, step)
         if state[PHASE] >= DONE:
@@ -197,13 +197,15 @@ def run_free(state, path, speeds, heading, final_turn, limits, track, step, wall
         # position first, then angle, each from the velocities at the start of the step, as Chipmunk does
         x = state[X] + state[SPEED] * math.cos(state[HEADING]) * step
         y = state[Y] + state[SPEED] * math.sin(state[HEADING]) * step
-        after = nearest_wall(walls, x, y)[0] - radius
-        if after < 0.0 and after < clearance - 1e-9:
-            return row, True
-        clearance = after
-        state[DISTANCE] += state[SPEED] * step
+        moved = state[SPEED] * step
+        if moved <= clear:
+            clear -= moved
+        else:
+            clear = nearest_wall(walls, x, y)[0] - radius
+            if clear < 0.0 and clear < nearest_wall(walls, state[X], state[Y])[0] - radius - 1e-9:
+                return row, True
         state[X], state[Y] = x, y
         state[HEADING] = _wrap(state[HEADING] + state[RATE] * step)
-        forget(state, state[SPEED] * step)
+        forget(state, moved)
         trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = x, y, state[HEADING]
     return trajectory.shape[0], False

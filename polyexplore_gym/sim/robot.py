@@ -49,6 +49,15 @@ def walls_near(segments, x_min, y_min, x_max, y_max):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
+def way_length(trajectory):  # type: ignore[no-untyped-def]
+    """Length (m) of the way of the centre along a trajectory (m, 2 or more)."""
+    total = 0.0
+    for i in range(1, trajectory.shape[0]):
+        total += math.hypot(trajectory[i, 0] - trajectory[i - 1, 0], trajectory[i, 1] - trajectory[i - 1, 1])
+    return total
+
+
+@njit(cache=True)
 def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
     """First t in [0, 1] at which the point t (dx, dy) comes within radius of the segment a, b; inf if never.
 

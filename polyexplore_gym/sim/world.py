@@ -13,7 +13,7 @@ from polyexplore_gym.errors import InvalidMotionError
 from polyexplore_gym.sim import follower
 from polyexplore_gym.sim.laser import Laser
 from polyexplore_gym.sim.pose import wrap
-from polyexplore_gym.sim.robot import glide, nearest_wall, walls_near
+from polyexplore_gym.sim.robot import glide, nearest_wall, walls_near, way_length
 
 _PATH_START = 1e-3
 _SHORTEST_LEG = 1e-4
@@ -23,6 +23,10 @@ _SUBSTEP = 0.02
 """In contact the robot moves at most this share of its radius in a step of the engine."""
 _BUMP = 0.02
 """A drive ends when a wall has taken this much of the commanded motion, m."""
+_ARRIVED = 0.05
+"""A drive that ends farther than this (m) from the end of its path has not arrived."""
+_PENETRATION = 1e-3
+"""The disc never stands deeper than this in a wall, m."""
 _ROWS = 2048
 
 
@@ -75,7 +79,7 @@ class World:
             raise InvalidMotionError(f"start pose {pose!r}: expected three finite numbers")
         start[2] = wrap(start[2])
         distance = nearest_wall(walls, start[0], start[1])[0]
-        if distance < robot.radius - 1e-3:
+        if distance < robot.radius - _PENETRATION:
             raise InvalidMotionError(
                 f"start pose {start.tolist()}: {distance:.3f} m from a wall, the robot's radius is {robot.radius} m"
             )
@@ -84,7 +88,6 @@ class World:
         self._walls = walls
         self._pose = start
         self._limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
-        self._engine: _Engine | None = None
 
     @property
     def pose(self) -> np.ndarray:
@@ -145,9 +148,8 @@ class World:
     def _follow(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
         robot, step = self.robot, self.config.time_step
         reach = robot.radius + _MARGIN
-        near = walls_near(self._walls, *(path.min(axis=0) - reach), *(path.max(axis=0) + reach))
-        walls = self._walls[near]
-        state = np.zeros(9)
+        walls = self._walls[walls_near(self._walls, *(path.min(axis=0) - reach), *(path.max(axis=0) + reach))]
+        state = np.zeros(8)
         state[:3] = self._pose
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
         speeds = follower.vertex_speeds(path, robot.max_speed, robot.max_acceleration, robot.max_turn_acceleration)
@@ -164,58 +166,61 @@ class World:
             if state[follower.PHASE] >= follower.DONE:
                 break
             if contact:
-                if engine is None:
-                    engine = self._engine = self._engine or _Engine(robot)
-                    engine.begin(self._walls, near)
+                engine = engine or _Engine(robot, walls)
                 engine.step(state, step)
                 parts.append(state[None, :3].copy())
                 done += 1
                 if state[follower.DEFICIT] > _BUMP:
                     collided = True
                     break
-        self._settle(state, walls)
         trajectory = np.concatenate(parts)
-        trajectory[-1] = state[:3]
+        if engine is not None:
+            trajectory = self._settle(trajectory, walls)
         trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
         self._pose = trajectory[-1].copy()
-        arrived = bool(state[follower.PHASE] == follower.DONE)
-        return DriveResult(trajectory, float(state[follower.DISTANCE]), done * step, collided, arrived)
+        ended = state[follower.PHASE] >= follower.DONE
+        away = math.hypot(self._pose[0] - path[-1, 0], self._pose[1] - path[-1, 1]) > _ARRIVED
+        arrived = bool(state[follower.PHASE] == follower.DONE) and not away
+        collided = collided or (ended and not arrived)  # nothing but a wall keeps the follower from its goal
+        return DriveResult(trajectory, float(way_length(trajectory)), done * step, bool(collided), arrived)
 
-    def _settle(self, state: np.ndarray, walls: np.ndarray) -> None:
-        """Move the disc out of the walls by what the contact left of penetration."""
-        radius = self.robot.radius
+    def _settle(self, trajectory: np.ndarray, walls: np.ndarray) -> np.ndarray:
+        """Move the last pose out of the walls by what the contact left of penetration, some millimetres at most.
+
+        In a wedge too acute for that the robot is set back along its way to where it stood clear.
+        """
+        radius, end = self.robot.radius, trajectory[-1]
         for _ in range(50):
-            distance, px, py = nearest_wall(walls, state[0], state[1])
+            distance, px, py = nearest_wall(walls, end[0], end[1])
             if distance >= radius or distance == 0.0:
-                return
+                break
             scale = (radius + 1e-7 - distance) / distance
-            state[0] += (state[0] - px) * scale
-            state[1] += (state[1] - py) * scale
+            end[0] += (end[0] - px) * scale
+            end[1] += (end[1] - py) * scale
+        while len(trajectory) > 1 and nearest_wall(walls, *trajectory[-1, :2])[0] < radius - _PENETRATION:
+            trajectory = trajectory[:-1]
+        return trajectory
 
 
 class _Engine:
-    """The pymunk space: walls as static segments, added when a drive first comes near them, and the robot's body."""
+    """The pymunk space of one drive: the walls near the path as static segments, and the robot's body.
 
-    def __init__(self, robot: RobotConfig) -> None:
+    It lives no longer than the drive, so that no drive depends on the contacts of an earlier one.
+    """
+
+    def __init__(self, robot: RobotConfig, walls: np.ndarray) -> None:
         self._space = pymunk.Space()
         self._space.collision_slop = 1e-4
-        self._space.collision_bias = 0.0
+        self._space.collision_bias = 0.0  # overlap is removed within a step
         self._body = pymunk.Body(robot.mass, pymunk.moment_for_circle(robot.mass, 0.0, robot.radius))
         shape = pymunk.Circle(self._body, robot.radius)
         shape.friction = 0.0
-        self._space.add(self._body, shape)
+        static = self._space.static_body
+        self._space.add(
+            self._body, shape, *(pymunk.Segment(static, (a, b), (c, d), 0.0) for a, b, c, d in walls.tolist())
+        )
         self._radius = robot.radius
-        self._added: set[int] = set()
         self._stands: tuple[float, float] | None = None
-
-    def begin(self, walls: np.ndarray, near: np.ndarray) -> None:
-        """Start a drive from standstill among the walls of these rows."""
-        self._stands = None
-        new = [int(k) for k in near if int(k) not in self._added]
-        if new:
-            static = self._space.static_body
-            self._space.add(*(pymunk.Segment(static, walls[k, :2].tolist(), walls[k, 2:].tolist(), 0.0) for k in new))
-            self._added.update(new)
 
     def step(self, state: np.ndarray, step: float) -> None:
         """One time step at the commanded velocity (wheels do not slip on command), contacts resolved."""
@@ -238,7 +243,6 @@ class _Engine:
         dx, dy = end.x - x, end.y - y
         achieved = dx * c + dy * s
         state[follower.DEFICIT] += speed * step - achieved
-        state[follower.DISTANCE] += math.hypot(dx, dy)
         state[follower.SPEED] = max(0.0, achieved / step)
         state[follower.X], state[follower.Y] = end.x, end.y
         state[follower.HEADING] = wrap(heading + rate * step)
