@@ -35,7 +35,6 @@ def motion(before: Snapshot, after: Snapshot, chosen: int | None = None, step: f
     if len(new) < 2:
         return
     lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(new[:, :2], axis=0).T))])
-    heading = float(before.pose[2])
     for at in np.arange(step, lengths[-1], step):
         k = int(np.searchsorted(lengths, at, side="right"))  # new[k - 1] is passed, new[k] lies ahead
         a, b = new[k - 1, :2], new[k, :2]
