@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 
 from polyexplore_gym.floorplan.building import Box
 
@@ -77,6 +78,21 @@ def free_standing(
         if not any(overlap(grow(box, PASSAGE), k) for k in keep_out):
             return box
     return None
+
+
+def outline(rng: np.random.Generator, box: Box, room: Box, bevelled: float) -> shapely.Polygon:
+    """The piece as a polygon; with probability `bevelled` a corner away from the room's walls is cut off."""
+    x0, y0, x1, y1 = box
+    corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    free = [k for k, (x, y) in enumerate(corners) if x not in (room[0], room[2]) and y not in (room[1], room[3])]
+    if not free or rng.random() >= bevelled:
+        return shapely.box(*box)
+    k = free[int(rng.integers(len(free)))]
+    dx, dy = (round(side * rng.uniform(0.3, 0.7)) for side in (x1 - x0, y1 - y0))
+    x, y = corners[k]
+    beside = x + dx if x == x0 else x - dx, y + dy if y == y0 else y - dy
+    cut = [(x, beside[1]), (beside[0], y)] if k % 2 == 0 else [(beside[0], y), (x, beside[1])]
+    return shapely.Polygon([*corners[:k], *cut, *corners[k + 1 :]])
 
 
 def grid(room: Box, width: int, depth: int, aisle_x: int, aisle_y: int, keep_out: Sequence[Box]) -> list[Box]:

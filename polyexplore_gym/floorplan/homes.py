@@ -24,13 +24,13 @@ from polyexplore_gym.floorplan.model import FloorPlan
 
 AREA_RANGE = (30.0, 320.0)
 """Free area of a home, m2."""
-_DOORS = (800, 800, 850, 900, 900, 1000)
+_DOORS = (800, 850, 900, 900, 950, 1000, 1200)
 _MIN_SIDE = 1700
 
 
 def draw_home(rng: np.random.Generator, name: str, meta: dict[str, Any]) -> FloorPlan | None:
     """One home, or None if the draw failed."""
-    area = float(np.clip(rng.lognormal(np.log(105.0), 0.5), 45.0, 320.0))
+    area = float(np.clip(rng.lognormal(np.log(110.0), 0.65), 45.0, 340.0))
     aspect = rng.uniform(1.05, 1.9)
     long_side = round(1000 * np.sqrt(area * aspect))
     short_side = round(1000 * np.sqrt(area / aspect))
@@ -48,7 +48,8 @@ def draw_home(rng: np.random.Generator, name: str, meta: dict[str, Any]) -> Floo
     free = union_of([*rooms, *doors, *merged])
     obstacles = _built_in(rng, rooms, doors, merged)
     if rng.random() < 0.6:
-        obstacles += _furnish(rng, cells, rooms, doors + merged)
+        bevelled = float(rng.choice([0.0, 0.2, 0.5]))
+        obstacles += _furnish(rng, cells, rooms, doors + merged, bevelled)
     plan = finish(free, obstacles, name, meta)
     return plan if plan is not None and AREA_RANGE[0] <= plan.area <= AREA_RANGE[1] else None
 
@@ -74,7 +75,7 @@ def _split(rng: np.random.Generator, box: Box, limit: float, cells: list[Cell], 
 def _plain(rng: np.random.Generator, box: Box) -> list[Cell]:
     cells: list[Cell] = []
     area = (box[2] - box[0]) * (box[3] - box[1]) * 1e-6
-    _split(rng, box, float(np.clip(area / rng.uniform(4.0, 8.0), 7.0, 22.0)), cells)
+    _split(rng, box, float(np.clip(area / rng.uniform(3.5, 7.0), 8.0, 28.0)), cells)
     max(cells, key=lambda c: c.area).kind = "living"
     return cells
 
@@ -84,7 +85,7 @@ def _with_corridor(rng: np.random.Generator, box: Box) -> list[Cell]:
     x0, y0, x1, y1 = box
     cells: list[Cell] = []
     living = x0 + int((x1 - x0) * rng.uniform(0.25, 0.45))
-    _split(rng, (x0, y0, living, y1), float(rng.uniform(22, 40)), cells, "living")
+    _split(rng, (x0, y0, living, y1), float(rng.uniform(24, 48)), cells, "living")
     width = int(rng.integers(105, 150)) * 10
     depth = y1 - y0
     if depth < 2 * 2600 + width or rng.random() < 0.15:
@@ -100,7 +101,7 @@ def _with_corridor(rng: np.random.Generator, box: Box) -> list[Cell]:
     for bottom, top in ((y0, low), (low + width, y1)):
         x = living
         while x < end and top - bottom >= _MIN_SIDE:
-            share = int(rng.integers(180, 450)) * 10
+            share = int(rng.integers(200, 520)) * 10
             nxt = end if end - x - share < 1900 else x + share
             _bedroom(rng, (x, bottom, nxt, top), cells)
             x = nxt
@@ -148,13 +149,13 @@ def _doors(rng: np.random.Generator, cells: list[Cell], thickness: int) -> tuple
         if "corridor" in (a.kind, b.kind):
             return 0.0
         # Baths and closets are ends, not ways through.
-        return 0.6 if a.kind == "living" else 1.0 + (2.0 if a.area < 9 else 0.0)
+        return 0.3 if a.kind == "living" else 1.5 + (2.0 if a.area < 9 else 0.0)
 
     tree = spanning_walls(rng, cells, walls, hubs[0], cost)
     if len(tree) != len(cells) - 1:
         return None
     extra = [w for w in walls if w not in tree and min(cells[w.a].area, cells[w.b].area) > 6]
-    chosen = [*tree, *(w for w in extra if rng.random() < 0.07)]
+    chosen = [*tree, *(w for w in extra if rng.random() < 0.04)]
     doors: list[Box] = []
     merged: list[Box] = []
     for wall in chosen:
@@ -183,7 +184,9 @@ def _built_in(rng: np.random.Generator, rooms: list[Box], doors: list[Box], merg
     return items
 
 
-def _furnish(rng: np.random.Generator, cells: list[Cell], rooms: list[Box], doors: list[Box]) -> list[Any]:
+def _furnish(
+    rng: np.random.Generator, cells: list[Cell], rooms: list[Box], doors: list[Box], bevelled: float
+) -> list[Any]:
     """Beds, wardrobes, sofas, kitchen units; tables stand free and some are round."""
     keep_out = [furniture.grow(d, 650) for d in doors]
     items: list[Any] = []
@@ -192,7 +195,7 @@ def _furnish(rng: np.random.Generator, cells: list[Cell], rooms: list[Box], door
             continue
         sizes = _pieces(rng, cell)
         placed = furniture.along_walls(rng, room, sizes, keep_out)
-        items += [shapely.box(*b) for b in placed]
+        items += [furniture.outline(rng, b, room, bevelled) for b in placed]
         if cell.area > 11 and rng.random() < (0.7 if cell.kind == "living" else 0.25):
             width, depth = int(rng.integers(70, 180)) * 10, int(rng.integers(70, 100)) * 10
             table = furniture.free_standing(rng, room, width, depth, [*keep_out, *placed])

@@ -49,17 +49,17 @@ def build(rng: np.random.Generator, cells: list[Cell], thickness: int) -> tuple[
     cells, doors, merged = openings
     rooms = [inner_box(c, thickness) for c in cells]
     furnished = rng.random() < 0.5
-    obstacles = [shapely.box(*b) for b in _obstacles(rng, cells, rooms, doors, merged, furnished)]
+    obstacles = _obstacles(rng, cells, rooms, doors, merged, furnished)
     return union_of([*rooms, *doors, *merged]), obstacles
 
 
 def _floor(rng: np.random.Generator) -> list[Cell]:
     """Corridors along x and y; the blocks between them hold rooms, open plans, courtyards, or are left out."""
     along = int(rng.choice([1, 2, 2, 2, 3]))
-    across = int(rng.choice([0, 1, 2])) if along == 1 else int(rng.choice([1, 2, 2, 3]))
-    depths = _bands(rng, along, (380, 700), (700, 1500))
+    across = int(rng.choice([0, 1, 2])) if along == 1 else int(rng.choice([1, 2, 2, 3, 3]))
+    depths = _bands(rng, along, (380, 700), (700, 1600))
     # With one corridor only, the building is a bar; cross corridors at the ends keep a row of rooms beyond.
-    widths = _bands(rng, across, (450, 1400), (900, 2200)) if across else [int(rng.integers(1800, 5200)) * 10]
+    widths = _bands(rng, across, (450, 1400), (1000, 2600)) if across else [int(rng.integers(2000, 7000)) * 10]
     xs, ys = np.concatenate([[0], np.cumsum(widths)]), np.concatenate([[0], np.cumsum(depths)])
     dropped = _dropped(rng, len(xs) // 2, len(ys) // 2)
     cells: list[Cell] = []
@@ -148,10 +148,10 @@ def _row(rng: np.random.Generator, length: int, depth: int) -> list[tuple[int, i
     module = int(rng.integers(260, 400)) * 10
     parts, x = [], 0
     while x < length:
-        if style < 0.4:
+        if style < 0.35:
             step = module * int(rng.choice([1, 1, 1, 2]))
-        elif style < 0.8:
-            step = int(np.clip(rng.lognormal(np.log(4000), 0.4), 2400, 11000))
+        elif style < 0.7:
+            step = int(np.clip(rng.lognormal(np.log(4600), 0.4), 2400, 11000))
         else:
             step = int(rng.integers(600, 1100)) * 10
         end = length if length - x - step < 2400 else x + step
@@ -227,18 +227,20 @@ def _obstacles(
     doors: list[Box],
     merged: list[Box],
     furnished: bool,
-) -> list[Box]:
+) -> list[Any]:
     """Columns in large rooms, pilasters on their walls, desks and cupboards."""
     keep_out = [furniture.grow(b, 700) for b in (*doors, *merged)]
     column = int(rng.integers(25, 60)) * 10
     pitch = int(rng.integers(400, 700)) * 10
     pilasters = rng.random() < 0.35
-    items: list[Box] = []
+    bevelled = float(rng.choice([0.0, 0.2, 0.5]))
+    items: list[Any] = []
     for cell, room in zip(cells, rooms, strict=True):
         near = [k for k in keep_out if furniture.overlap(k, room)]
         if cell.kind == "corridor":
             if min(room[2] - room[0], room[3] - room[1]) > 1900 and rng.random() < 0.25:
-                items += furniture.along_walls(rng, room, [(int(rng.integers(8, 24)) * 100, 400)], near)
+                lockers = furniture.along_walls(rng, room, [(int(rng.integers(8, 24)) * 100, 400)], near)
+                items += [shapely.box(*b) for b in lockers]
             continue
         placed: list[Box] = []
         if cell.kind == "open" or cell.area > 70:
@@ -257,5 +259,5 @@ def _obstacles(
         elif pilasters and cell.area > 12:
             blocked = [*near, *(furniture.grow(p, 750) for p in placed)]
             placed += furniture.along_walls(rng, room, [(column, 200)] * 2, blocked, tries=2)
-        items += placed
+        items += [furniture.outline(rng, b, room, bevelled) for b in placed]
     return items
