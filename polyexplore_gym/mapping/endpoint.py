@@ -16,7 +16,8 @@ from numba import njit
 from polyexplore_gym.mapping.fit import fit, normal_variance
 
 SPLIT_GATE = 3.5**2  # squared deviation from the chord over its variance
-JOIN_GATE = 13.8  # chi-square, 2 degrees of freedom, 99.9 %: oversplitting is repaired generously
+JOIN_GATE = 20.0  # chi-square of one line instead of two: 2 degrees of freedom, and the choice of the place
+JOIN_THREE_GATE = 34.0  # the same for one line instead of three
 BREAK_INCIDENCE = math.radians(80.0)  # neighbouring returns on a wall seen more obliquely start a new run
 
 
@@ -105,23 +106,34 @@ def join(
             rho, alpha, _, _, _, chi2 = fit(x, y, order[box[p, 0] : box[p, 1] + 1], var_range, var_angle)
             line[p, 0], line[p, 1], line[p, 2] = rho, alpha, chi2
             p += 1
-    changed = True
-    while changed:
-        changed = False
+    # neighbours first; then three at once, where a chance tilt of the middle one keeps the outer two apart
+    width = 2
+    while width <= 3:
+        joined = False
         kept = 0
-        for q in range(p):
-            if kept > 0 and run[box[kept - 1, 0]] == run[box[q, 0]] and box[q, 0] - box[kept - 1, 1] <= 3:
-                joint = order[box[kept - 1, 0] : box[q, 1] + 1]
-                rho, alpha, _, _, _, chi2 = fit(x, y, joint, var_range, var_angle)
-                between = box[q, 0] - box[kept - 1, 1] - 1
-                if chi2 - line[kept - 1, 2] - line[q, 2] < JOIN_GATE + 4.0 * between:
-                    box[kept - 1, 1] = box[q, 1]
-                    line[kept - 1, 0], line[kept - 1, 1], line[kept - 1, 2] = rho, alpha, chi2
-                    changed = True
-                    continue
+        q = 0
+        while q < p:
             box[kept], line[kept] = box[q], line[q]
             kept += 1
+            q += 1
+            first = kept - width
+            if first < 0:
+                continue
+            free, apart = 0, 0.0
+            for r in range(first, kept):
+                apart += line[r, 2]
+                if r > first:
+                    free += box[r, 0] - box[r - 1, 1] - 1
+            if run[box[first, 0]] != run[box[kept - 1, 1]] or free > 2 * (width - 1):
+                continue
+            rho, alpha, _, _, _, chi2 = fit(x, y, order[box[first, 0] : box[kept - 1, 1] + 1], var_range, var_angle)
+            if chi2 - apart < (JOIN_GATE if width == 2 else JOIN_THREE_GATE) + 4.0 * free:
+                box[first, 1] = box[kept - 1, 1]
+                line[first, 0], line[first, 1], line[first, 2] = rho, alpha, chi2
+                kept = first + 1
+                joined = True
         p = kept
+        width = 2 if joined else width + 1
     return box[:p], line[:p, 0].copy(), line[:p, 1].copy()
 
 

@@ -12,6 +12,7 @@ from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
 from polyexplore_gym.mapping.grid import Grid, grid_put, grid_query, grid_remove
 
 MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
+SAME_SIDE = 1.7  # rad; a segment facing farther away than this does not stand for another
 STILL = 2e-3  # m; a row whose ends move less counts as untouched
 COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
@@ -115,6 +116,13 @@ def free_row(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
 
 
 @njit(cache=True)
+def free_line(lines: Lines, slots: Slots, line: int) -> None:
+    lines.alive[line] = False
+    slots.lines[slots.count[1]] = line
+    slots.count[1] += 1
+
+
+@njit(cache=True)
 def publish(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
     """Bring the published segment up to date if an end moved by 2 mm or more."""
     e, s = rows.ends[row], rows.segments[row]
@@ -131,6 +139,20 @@ def segment_distance(px: float, py: float, s: np.ndarray) -> float:
     q = dx * dx + dy * dy
     t = 0.0 if q == 0.0 else min(max(((px - s[0]) * dx + (py - s[1]) * dy) / q, 0.0), 1.0)
     return math.hypot(px - s[0] - t * dx, py - s[1] - t * dy)
+
+
+@njit(cache=True)
+def across(alpha: float, p: np.ndarray, s: np.ndarray) -> float:
+    """Standard deviation of the line across its direction at the middle of segment s, m."""
+    h = 0.5 * ((s[0] + s[2]) * math.sin(alpha) - (s[1] + s[3]) * math.cos(alpha))
+    return math.sqrt(max(p[1, 1] + 2.0 * h * p[0, 1] + h * h * p[0, 0], 0.0))
+
+
+@njit(cache=True)
+def clip(s: np.ndarray, a: float, b: float) -> None:
+    """Keep the part of segment s from share a to share b of its length."""
+    x, y, dx, dy = s[0], s[1], s[2] - s[0], s[3] - s[1]
+    s[0], s[1], s[2], s[3] = x + a * dx, y + a * dy, x + b * dx, y + b * dy
 
 
 @njit(cache=True)
@@ -296,16 +318,58 @@ def lay(
         e[0], e[1] = rho * ca - span[q, 0] * sa, rho * sa + span[q, 0] * ca
         e[2], e[3] = rho * ca - span[q, 1] * sa, rho * sa + span[q, 1] * ca
         rows.end_variance[row, 0], rows.end_variance[row, 1] = span[q, 2], span[q, 3]
-        x, y = 0.5 * (e[0] + e[2]), 0.5 * (e[1] + e[3])
-        h = x * sa - y * ca
-        rows.sigma[row] = math.sqrt(max(p[1, 1] + 2.0 * h * p[0, 1] + h * h * p[0, 0], 0.0))
+        rows.sigma[row] = across(alpha, p, e)
         publish(rows, grid, slots, row)
+
+
+@njit(cache=True)
+def unlink(rows: Rows, lines: Lines, slots: Slots, row: int) -> None:
+    """Take a row off its line; a line without rows is freed."""
+    line = rows.line[row]
+    at = lines.first[line]
+    if at == row:
+        lines.first[line] = rows.next[row]
+    else:
+        while rows.next[at] != row:
+            at = rows.next[at]
+        rows.next[at] = rows.next[row]
+    if lines.first[line] < 0:
+        free_line(lines, slots, line)
+
+
+@njit(cache=True)
+def clear_covered(
+    line: int, rows: Rows, lines: Lines, grid: Grid, slots: Slots, sigma_range: float, found: np.ndarray
+) -> None:
+    """Remove fragments, and shorter segments seen from the same side, that the line's changed rows cover."""
+    _, alpha, _ = oriented(lines, line)
+    row = lines.first[line]
+    while row >= 0:
+        w = rows.segments[row]
+        fresh = rows.touched[row] == slots.count[2]
+        length = math.hypot(w[2] - w[0], w[3] - w[1])
+        for q in range(box_query(grid, w, 0.5, found) if fresh else 0):
+            f = found[q]
+            g = rows.segments[f]
+            tolerance = COVER + 3.0 * rows.sigma[f]
+            if rows.line[f] >= 0:
+                if rows.line[f] == line or math.hypot(g[2] - g[0], g[3] - g[1]) > length:
+                    continue
+                _, other, _ = oriented(lines, rows.line[f])
+                if abs(wrap(alpha - other)) > SAME_SIDE:
+                    continue
+                tolerance = COVER + sigma_range + 3.0 * math.hypot(rows.sigma[f], rows.sigma[row])
+            if segment_distance(g[0], g[1], w) <= tolerance and segment_distance(g[2], g[3], w) <= tolerance:
+                if rows.line[f] >= 0:
+                    unlink(rows, lines, slots, f)
+                free_row(rows, grid, slots, f)
+        row = rows.next[row]
 
 
 @njit(cache=True)
 def covered(
     s: np.ndarray, sigma: float, side_alpha: float, any_side: bool, rows: Rows, lines: Lines, grid: Grid, stamp: int,
-    found: np.ndarray,
+    sigma_range: float, found: np.ndarray,
 ) -> tuple[float, float]:  # fmt: skip
     """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a > b if none.
 
@@ -313,7 +377,7 @@ def covered(
     With any_side False only rows seen from the same side (normal direction side_alpha) count.
     """
     tolerance = COVER + 3.0 * sigma
-    n = box_query(grid, s, tolerance, found)
+    n = box_query(grid, s, tolerance + 0.5, found)
     length = math.hypot(s[2] - s[0], s[3] - s[1])
     steps = max(1, int(math.ceil(length / 0.05)))
     first, last = 2.0, -1.0
@@ -329,9 +393,10 @@ def covered(
                     continue
             elif not any_side:
                 _, alpha, _ = oriented(lines, j)
-                if abs(wrap(alpha - side_alpha)) > MAX_TURN:
+                if abs(wrap(alpha - side_alpha)) > SAME_SIDE:
                     continue
-            if segment_distance(px, py, rows.segments[row]) <= tolerance:
+            reach = tolerance if any_side else COVER + sigma_range + 3.0 * math.hypot(sigma, rows.sigma[row])
+            if segment_distance(px, py, rows.segments[row]) <= reach:
                 hit = True
                 break
         if not hit:
@@ -362,6 +427,7 @@ def insert(
     slots.count[2] += 1
     slots.count[3] = 0
     stamp = slots.count[2]
+    sigma_range = math.sqrt(var_range)
     n = rho.size
     found = np.empty(rows.alive.size, np.int64)
     match = np.empty((32, 4))
@@ -430,9 +496,7 @@ def insert(
                 target = j
             elif distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
                 r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
-                lines.alive[j] = False
-                slots.lines[slots.count[1]] = j
-                slots.count[1] += 1
+                free_line(lines, slots, j)
                 # its rows become fresh pieces of the target below
                 row = lines.first[j]
                 while row >= 0:
@@ -445,15 +509,14 @@ def insert(
         for k in range(of.size):
             if of[k] != i:
                 continue
+            fresh[m] = placed[k]
             if target < 0:
-                h = 0.5 * (placed[k, 0] + placed[k, 2]) * math.sin(a0) - 0.5 * (placed[k, 1] + placed[k, 3]) * math.cos(
-                    a0
-                )
-                sigma = math.sqrt(max(p0[1, 1] + 2.0 * h * p0[0, 1] + h * h * p0[0, 0], 0.0))
-                a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, found)
+                # a wall known already, but not within the gate: only what is new of it
+                sigma = across(a0, p0, placed[k])
+                a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, sigma_range, found)
                 if a > b:
                     continue
-            fresh[m] = placed[k]
+                clip(fresh[m], a, b)
             m += 1
         if m == 0:
             continue
@@ -464,19 +527,7 @@ def insert(
             lines.first[target] = -1
         store(lines, target, r0, a0, p0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
-        # fragments that the wall now covers go
-        row = lines.first[target]
-        while row >= 0:
-            w = rows.segments[row]
-            for q in range(box_query(grid, w, 1.0, found)):
-                f = found[q]
-                if rows.line[f] >= 0:
-                    continue
-                g = rows.segments[f]
-                tolerance = COVER + 3.0 * rows.sigma[f]
-                if segment_distance(g[0], g[1], w) <= tolerance and segment_distance(g[2], g[3], w) <= tolerance:
-                    free_row(rows, grid, slots, f)
-            row = rows.next[row]
+        clear_covered(target, rows, lines, grid, slots, sigma_range, found)
 
     piece = np.empty(4)
     for k in range(fragments.shape[0]):
@@ -486,13 +537,12 @@ def insert(
             piece[2 * e], piece[2 * e + 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
             d2 = max(d2, x * x + y * y)
         sigma = math.sqrt(var_range + var_xy + (var_angle + pose_covariance[2, 2]) * d2)
-        a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, found)
+        a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, sigma_range, found)
         if a > b:
             continue
         row = new_row(rows, slots)
         rows.line[row], rows.side[row], rows.next[row], rows.sigma[row] = -1, 0, -1, sigma
-        e4 = rows.ends[row]
-        e4[0], e4[1] = piece[0] + a * (piece[2] - piece[0]), piece[1] + a * (piece[3] - piece[1])
-        e4[2], e4[3] = piece[0] + b * (piece[2] - piece[0]), piece[1] + b * (piece[3] - piece[1])
+        clip(piece, a, b)
+        rows.ends[row] = piece
         rows.end_variance[row] = sigma * sigma
         publish(rows, grid, slots, row)
