@@ -27,8 +27,8 @@ _GOAL_TOLERANCE = 0.004
 _HEADING_TOLERANCE = math.radians(0.2)
 _LOST = 0.5
 _LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.08, 0.35, 0.3
-_MARGIN = 0.9
-"""Share of the acceleration limits that is planned with; the rest is for corrections."""
+_MARGIN, _BACKWARD = 0.9, 0.8
+"""Shares of the acceleration limits planned with when braking, and between corners; the rest is for corrections."""
 _GRAZING = math.tan(math.radians(15.0)) ** 2
 _LAST_LEG = 0.5
 """A last leg shorter than this (m) leaves no room to settle on it: the robot stops and turns before it."""
@@ -64,7 +64,7 @@ def vertex_speeds(path, max_speed, acceleration, turn_acceleration):  # type: ig
             elif turn < (0.005 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
                 length = min(8.0 * _CUT / turn, ahead, behind)
                 out[k] = min(max_speed, 0.5 * length * math.sqrt(0.6 * turn_acceleration / turn))
-        out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * acceleration * ahead))
+        out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * _BACKWARD * acceleration * ahead))
     return out
 
 
