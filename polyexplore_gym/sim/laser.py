@@ -225,7 +225,7 @@ class Laser:
     def scan(self, segments: np.ndarray, pose: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """As `measure`, with the standard normal noise (2, n) given; zeros give the true ranges."""
         pose = np.ascontiguousarray(pose, dtype=np.float64)
-        if pose.shape != (3,) or not math.isfinite(pose[0] + pose[1] + pose[2]):
+        if pose.shape != (3,) or not all(map(math.isfinite, pose)):
             raise InvalidMotionError(f"sensor pose {pose!r}: expected three finite numbers")
         config = self.config
         return _measure(

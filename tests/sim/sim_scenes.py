@@ -1,0 +1,56 @@
+"""Random walls for the tests of the simulated world, and the shared floor plans where they exist."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+
+def random_walls(rng: np.random.Generator, count: int, side: float = 14.0) -> np.ndarray:
+    """Free-standing walls (count, 4) strewn over a square: every third axis-parallel, now and then two joined."""
+    start = rng.uniform(-side / 2, side / 2, (count, 2))
+    way = rng.normal(0.0, 1.5, (count, 2))
+    way[::3, 0] = 0.0
+    walls = np.hstack([start, start + way])
+    for k in range(1, count, 4):
+        walls[k, :2] = walls[k - 1, 2:]
+    return walls
+
+
+def boxed(walls: np.ndarray, half: float) -> np.ndarray:
+    """The walls and a square around them, free space on the left."""
+    ring = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    return np.vstack([walls, np.hstack([ring, np.roll(ring, -1, axis=0)])])
+
+
+def clear_point(rng: np.random.Generator, walls: np.ndarray, half: float, radius: float) -> np.ndarray:
+    lines = shapely.multilinestrings(walls.reshape(-1, 2, 2))
+    while True:
+        point = rng.uniform(-half, half, 2)
+        if shapely.distance(lines, shapely.points(point)) > radius:
+            return point
+
+
+def lines_of(walls: np.ndarray) -> shapely.Geometry:
+    return shapely.multilinestrings(walls.reshape(-1, 2, 2))
+
+
+def shared_plans() -> list[Path]:
+    """The shared plans' files, smallest first; empty when there are none."""
+    default = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "floorplans"
+    folder = Path(os.environ.get("POLYEXPLORE_DATA", default))
+    return sorted(folder.glob("*.json"), key=lambda p: (p.stat().st_size, p.name))
+
+
+def load_polygon(path: Path) -> shapely.Polygon:
+    data = json.loads(path.read_text())
+    return shapely.Polygon(data["exterior"], data["holes"])
+
+
+def polygon_walls(polygon: shapely.Polygon) -> np.ndarray:
+    rings = [np.asarray(r.coords) for r in (polygon.exterior, *polygon.interiors)]
+    return np.concatenate([np.hstack([r[:-1], r[1:]]) for r in rings])
