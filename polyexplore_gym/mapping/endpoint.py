@@ -18,7 +18,7 @@ from polyexplore_gym.mapping.fit import fit, normal_variance
 SPLIT_GATE = 3.5**2  # squared deviation from the chord over its variance
 JOIN_GATE = 20.0  # chi-square of one line instead of two: 2 degrees of freedom, and the choice of the place
 JOIN_THREE_GATE = 34.0  # the same for one line instead of three
-BREAK_INCIDENCE = math.radians(80.0)  # neighbouring returns on a wall seen more obliquely start a new run
+BREAK_INCIDENCE = math.radians(86.0)  # neighbouring returns on a wall seen more obliquely start a new run
 
 
 @njit(cache=True)

@@ -1,0 +1,173 @@
+"""How many walls of an office scan are found, how many lines are true, and what it costs.
+
+Scenes are rectangular rooms along a corridor, with doors and thick walls. A wall counts if at least
+0.5 m of it is seen by at least 10 beams; a segment counts as right if it lies within 3 degrees and
+5 cm of a wall and half the length agrees. Precision is given for segments under the same bar, and
+for all. Run: python benchmarks/line_extraction.py [--scans 200]
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+
+import numpy as np
+import shapely
+
+from polyexplore_gym.config import MappingConfig, SensorConfig
+from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
+from polyexplore_gym.sim.laser import cast_rays
+
+ANGLES = np.linspace(-math.pi / 2, math.pi / 2, 361)
+
+
+def office(rng: np.random.Generator) -> tuple[np.ndarray, shapely.Polygon]:
+    """Walls (M, 4) and free space of two rows of rooms along a corridor, with pillars and cupboards."""
+    thickness, corridor = 0.15, rng.uniform(1.6, 2.6)
+    parts, furniture = [], []
+    for sign in (-1, 1):
+        x = 0.0
+        while x < 20.0:
+            width, depth = rng.uniform(2.8, 6.0), rng.uniform(3.0, 5.5)
+            near = sign * (0.5 * corridor + thickness)
+            far = near + sign * depth
+            parts.append(shapely.box(x, min(near, far), x + width, max(near, far)))
+            door = x + rng.uniform(0.3, width - 1.3)
+            parts.append(shapely.box(door, min(0, near), door + 0.9, max(0, near)))
+            if rng.random() < 0.6:  # a cupboard against the far wall
+                left, deep = x + rng.uniform(0.2, width - 1.4), rng.uniform(0.3, 0.6)
+                furniture.append(shapely.box(left, min(far, far - sign * deep), left + 1.2, max(far, far - sign * deep)))
+            if rng.random() < 0.3:  # a door to the next room
+                at = near + sign * rng.uniform(0.5, depth - 1.5)
+                parts.append(shapely.box(x + width - 0.1, min(at, at + sign), x + width + thickness + 0.1, max(at, at + sign)))
+            x += width + thickness
+    parts.append(shapely.box(0.0, -0.5 * corridor, 20.0, 0.5 * corridor))
+    free = shapely.union_all(parts).difference(shapely.union_all(furniture))
+    free = max(free.geoms, key=lambda g: g.area) if free.geom_type == "MultiPolygon" else free
+    free = free.simplify(1e-6)
+    rings = [np.array(r.coords) for r in (free.exterior, *free.interiors)]
+    return np.vstack([np.hstack([r[:-1], r[1:]]) for r in rings]), free
+
+
+def scans(count: int, sensor: SensorConfig, rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Walls in the robot frame, noise-free ranges and noisy ranges of so many scans."""
+    out = []
+    while len(out) < count:
+        walls, free = office(rng)
+        inner = free.buffer(-0.4)
+        for _ in range(10):
+            x, y = rng.uniform(0, 20), rng.uniform(-7, 7)
+            if not shapely.contains_xy(inner, x, y):
+                continue
+            heading = rng.uniform(-math.pi, math.pi)
+            c, s = math.cos(heading), math.sin(heading)
+            turn = np.array([[c, -s], [s, c]])
+            local = ((walls.reshape(-1, 2) - (x, y)) @ turn).reshape(-1, 4)
+            exact = cast_rays(local, 0.0, 0.0, ANGLES, sensor.max_range)
+            noisy = cast_rays(local, 0.0, 0.0, ANGLES + rng.normal(0, sensor.sigma_angle, 361), sensor.max_range)
+            out.append((local, exact, np.maximum(noisy + rng.normal(0, sensor.sigma_range, 361), 1e-3)))
+    return out[:count]
+
+
+def visible(walls: np.ndarray, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Seen piece of each wall (M, 4), and the number of beams on it."""
+    seen, beams = walls.copy(), np.zeros(len(walls), int)
+    hit = np.isfinite(exact)
+    points = np.c_[exact * np.cos(ANGLES), exact * np.sin(ANGLES)][hit]
+    for i, w in enumerate(walls):
+        u = w[2:] - w[:2]
+        length = math.hypot(*u)
+        u = u / length
+        t = (points - w[:2]) @ u
+        off = (points - w[:2]) @ np.array([-u[1], u[0]])
+        on = (np.abs(off) < 1e-6) & (t > -1e-6) & (t < length + 1e-6)
+        beams[i] = on.sum()
+        if beams[i]:
+            seen[i, :2], seen[i, 2:] = w[:2] + t[on].min() * u, w[:2] + t[on].max() * u
+    return seen, beams
+
+
+def agree(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether segment a lies within 3 degrees and 5 cm of segment b, with half of a's length beside b."""
+    ua, ub = a[2:] - a[:2], b[2:] - b[:2]
+    la, lb = math.hypot(*ua), math.hypot(*ub)
+    if la < 1e-9 or lb < 1e-9:
+        return False
+    ua, ub = ua / la, ub / lb
+    if abs(ua[0] * ub[1] - ua[1] * ub[0]) > math.sin(math.radians(3)):
+        return False
+    t = np.sort([(a[:2] - b[:2]) @ ub, (a[2:] - b[:2]) @ ub])
+    low, high = max(t[0], 0.0), min(t[1], lb)
+    if high - low < 0.5 * la:
+        return False
+    middle = 0.5 * (a[:2] + a[2:]) - b[:2]
+    return abs(middle[0] * ub[1] - middle[1] * ub[0]) < 0.05
+
+
+def score(sample: list, found: list[ScanLines]) -> dict[str, float]:
+    walls_n = walls_ok = big_n = big_ok = all_n = all_ok = 0
+    for (walls, exact, _), lines in zip(sample, found, strict=True):
+        seen, beams = visible(walls, exact)
+        length = np.hypot(seen[:, 2] - seen[:, 0], seen[:, 3] - seen[:, 1])
+        points = np.bincount(lines.point_segment[lines.point_segment >= 0], minlength=len(lines.segments))
+        for i in np.flatnonzero((length >= 0.5) & (beams >= 10)):
+            walls_n += 1
+            walls_ok += any(agree(seen[i], s) for s in lines.segments)
+        for s, n in zip(lines.segments, points, strict=True):
+            right = any(agree(s, seen[i]) for i in np.flatnonzero(beams > 0))
+            all_n, all_ok = all_n + 1, all_ok + right
+            if n >= 10 and math.hypot(s[2] - s[0], s[3] - s[1]) >= 0.5:
+                big_n, big_ok = big_n + 1, big_ok + right
+    return {
+        "recall": walls_ok / walls_n,
+        "precision": big_ok / big_n,
+        "precision of all": all_ok / all_n,
+        "walls": walls_n,
+        "segments": all_n,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scans", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    for sigma_range, degrees in ((0.01, 0.1), (0.02, 0.2), (0.05, 0.5)):
+        sensor = SensorConfig(sigma_range=sigma_range, sigma_angle=math.radians(degrees))
+        sample = scans(arguments.scans, sensor, np.random.default_rng(arguments.seed))
+        for start in ("endpoint", "hough"):
+            config = MappingConfig(start=start)
+            extract_lines(ANGLES, sample[0][2], sensor, config)
+            times, found = [], []
+            for _, _, ranges in sample:
+                begin = time.perf_counter()
+                found.append(extract_lines(ANGLES, ranges, sensor, config))
+                times.append(time.perf_counter() - begin)
+            result = "  ".join(f"{k} {v:.4f}" if v <= 1 else f"{k} {v}" for k, v in score(sample, found).items())
+            print(f"{sigma_range} m {degrees} deg  {start:8s}  {result}  {1e3 * np.median(times):.3f} ms a scan")
+    print(f"insert into a map of 5,000 lines: {1e3 * insert_time(np.random.default_rng(0)):.3f} ms a scan")
+
+
+def insert_time(rng: np.random.Generator, blocks: int = 40) -> float:
+    """Median time to insert an office scan into a map of 5,000 lines and more, s (copies of offices, far apart)."""
+    sensor = SensorConfig()
+    line_map, still = LineMap(sensor=sensor), np.zeros((3, 3))
+    sample = [extract_lines(ANGLES, r, sensor) for _, _, r in scans(200, sensor, rng)]
+    place = 0
+    while line_map.line_alive.sum() < 5000:
+        pose = np.array([12.0 * (place % blocks), 12.0 * (place // blocks), 0.3 * place])
+        line_map.insert(sample[place % len(sample)], pose, still)
+        place += 1
+    times = []
+    for k in range(400):
+        p = (k * 37) % place
+        pose = np.array([12.0 * (p % blocks), 12.0 * (p // blocks), 0.3 * p])
+        begin = time.perf_counter()
+        line_map.insert(sample[p % len(sample)], pose, still)
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times))
+
+
+if __name__ == "__main__":
+    main()
