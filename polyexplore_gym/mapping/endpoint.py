@@ -13,11 +13,12 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.mapping.fit import fit, normal_variance
+from polyexplore_gym.mapping.fit import distance2, fit, normal_variance
 
 SPLIT_GATE = 3.5**2  # squared deviation from the chord over its variance
 JOIN_GATE = 20.0  # chi-square of one line instead of two: 2 degrees of freedom, and the choice of the place
 JOIN_THREE_GATE = 34.0  # the same for one line instead of three
+ROUGH = 0.03  # accuracy of the fits that only choose, in standard deviations
 BREAK_INCIDENCE = math.radians(86.0)  # neighbouring returns on a wall seen more obliquely start a new run
 
 
@@ -28,10 +29,15 @@ def runs(x: np.ndarray, y: np.ndarray, beam: np.ndarray, resolution: float, var_
     run = np.zeros(m, np.int64)
     slope = math.sin(resolution) / math.sin(max(0.5 * math.pi - BREAK_INCIDENCE - resolution, resolution))
     noise = 3.0 * math.sqrt(2.0 * var_range)
-    for k in range(1, m):
-        reach = slope * min(math.hypot(x[k], y[k]), math.hypot(x[k - 1], y[k - 1])) + noise
-        near = beam[k] == beam[k - 1] + 1 and math.hypot(x[k] - x[k - 1], y[k] - y[k - 1]) <= reach
-        run[k] = run[k - 1] if near else run[k - 1] + 1
+    before = 0.0
+    for k in range(m):
+        d = math.sqrt(x[k] * x[k] + y[k] * y[k])
+        if k > 0:
+            reach = slope * min(d, before) + noise
+            dx, dy = x[k] - x[k - 1], y[k] - y[k - 1]
+            near = beam[k] == beam[k - 1] + 1 and dx * dx + dy * dy <= reach * reach
+            run[k] = run[k - 1] if near else run[k - 1] + 1
+        before = d
     return run
 
 
@@ -92,49 +98,64 @@ def split(x: np.ndarray, y: np.ndarray, run: np.ndarray, var_range: float, var_a
 
 
 @njit(cache=True)
+def fit_piece(
+    x: np.ndarray, y: np.ndarray, order: np.ndarray, lo: int, hi: int, var_range: float, var_angle: float, out: np.ndarray
+) -> None:
+    """Fit returns lo..hi roughly into out = lo, hi, rho, alpha, var_alpha, cov, var_rho, chi-square."""
+    out[0], out[1] = lo, hi
+    out[2], out[3], out[4], out[5], out[6], out[7] = fit(x, y, order[lo : hi + 1], var_range, var_angle, ROUGH)
+
+
+@njit(cache=True)
+def hopeless(x: np.ndarray, y: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two pieces differ so much that joining them need not be tried."""
+    k, j = int(a[1]), int(b[0])
+    p, q = np.empty((2, 2)), np.empty((2, 2))
+    p[0, 0], p[0, 1], p[1, 0], p[1, 1] = a[4], a[5], a[5], a[6]
+    q[0, 0], q[0, 1], q[1, 0], q[1, 1] = b[4], b[5], b[5], b[6]
+    return distance2(a[2], a[3], p, b[2], b[3], q, 0.5 * (x[k] + x[j]), 0.5 * (y[k] + y[j])) > 10.0 * JOIN_GATE
+
+
+@njit(cache=True)
 def join(
     x: np.ndarray, y: np.ndarray, run: np.ndarray, pieces: np.ndarray, var_range: float, var_angle: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Join neighbouring pieces of a run which one line explains. Returns pieces, rho, alpha (3 returns and more)."""
-    p = 0
-    box = np.empty((pieces.shape[0], 2), np.int64)
-    line = np.empty((pieces.shape[0], 3))  # rho, alpha, chi-square
     order = np.arange(x.size)
+    line = np.empty((pieces.shape[0] + 1, 8))
+    p = 0
     for q in range(pieces.shape[0]):
         if pieces[q, 1] - pieces[q, 0] >= 2:
-            box[p, 0], box[p, 1] = pieces[q, 0], pieces[q, 1]
-            rho, alpha, _, _, _, chi2 = fit(x, y, order[box[p, 0] : box[p, 1] + 1], var_range, var_angle)
-            line[p, 0], line[p, 1], line[p, 2] = rho, alpha, chi2
+            fit_piece(x, y, order, pieces[q, 0], pieces[q, 1], var_range, var_angle, line[p])
             p += 1
+    trial = np.empty(8)
     # neighbours first; then three at once, where a chance tilt of the middle one keeps the outer two apart
     width = 2
     while width <= 3:
         joined = False
         kept = 0
-        q = 0
-        while q < p:
-            box[kept], line[kept] = box[q], line[q]
+        for q in range(p):
+            line[kept] = line[q]
             kept += 1
-            q += 1
             first = kept - width
             if first < 0:
                 continue
-            free, apart = 0, 0.0
+            lo, hi = int(line[first, 0]), int(line[kept - 1, 1])
+            used, apart = 0, 0.0
             for r in range(first, kept):
-                apart += line[r, 2]
-                if r > first:
-                    free += box[r, 0] - box[r - 1, 1] - 1
-            if run[box[first, 0]] != run[box[kept - 1, 1]] or free > 2 * (width - 1):
+                apart += line[r, 7]
+                used += int(line[r, 1] - line[r, 0]) + 1
+            free = hi - lo + 1 - used
+            if run[lo] != run[hi] or free > 2 * (width - 1) or hopeless(x, y, line[first], line[kept - 1]):
                 continue
-            rho, alpha, _, _, _, chi2 = fit(x, y, order[box[first, 0] : box[kept - 1, 1] + 1], var_range, var_angle)
-            if chi2 - apart < (JOIN_GATE if width == 2 else JOIN_THREE_GATE) + 4.0 * free:
-                box[first, 1] = box[kept - 1, 1]
-                line[first, 0], line[first, 1], line[first, 2] = rho, alpha, chi2
+            fit_piece(x, y, order, lo, hi, var_range, var_angle, trial)
+            if trial[7] - apart < (JOIN_GATE if width == 2 else JOIN_THREE_GATE) + 4.0 * free:
+                line[first] = trial
                 kept = first + 1
                 joined = True
         p = kept
         width = 2 if joined else width + 1
-    return box[:p], line[:p, 0].copy(), line[:p, 1].copy()
+    return line[:p, :2].astype(np.int64), line[:p, 2].copy(), line[:p, 3].copy()
 
 
 @njit(cache=True)

@@ -55,11 +55,12 @@ def direction(x: np.ndarray, y: np.ndarray, index: np.ndarray) -> float:
 
 @njit(cache=True)
 def fit(
-    x: np.ndarray, y: np.ndarray, index: np.ndarray, var_range: float, var_angle: float
+    x: np.ndarray, y: np.ndarray, index: np.ndarray, var_range: float, var_angle: float, accuracy: float = 1e-6
 ) -> tuple[float, float, float, float, float, float]:
     """Weighted line fit to the points `index` (at least 2) of a scan seen from the origin.
 
-    Gauss-Newton in (rho, alpha) with the weights 1 / P_k frozen within an iteration. Returns
+    Gauss-Newton in (rho, alpha) with the weights 1 / P_k frozen within an iteration, until a step is
+    smaller than `accuracy` standard deviations of alpha. Returns
     rho (>= 0), alpha, var_alpha, cov_alpha_rho, var_rho (m, rad) and the chi-square of the
     residuals (n - 2 degrees of freedom).
     """
@@ -71,7 +72,9 @@ def fit(
         for k in index:
             dc = x[k] * ca + y[k] * sa
             psi = x[k] * sa - y[k] * ca
-            w = 1.0 / (var_range * dc * dc / (x[k] * x[k] + y[k] * y[k]) + var_angle * psi * psi)
+            # 1 / P_k, with d^2 = dc^2 + psi^2
+            d2 = dc * dc + psi * psi
+            w = d2 / (var_range * dc * dc + var_angle * psi * psi * d2)
             s0 += w
             s1 += w * psi
             s2 += w * psi * psi
@@ -84,7 +87,7 @@ def fit(
         chi2 = max(q - r1 * rho, 0.0)
         step = (r2 - r1 * psi_bar) / spp
         step = min(max(step, -0.3), 0.3)
-        if abs(step) < 1e-9:
+        if step * step * spp < accuracy * accuracy:
             break
         alpha += step
     var_alpha = 1.0 / spp
