@@ -27,6 +27,7 @@ _GOAL_TOLERANCE = 0.004
 _HEADING_TOLERANCE = math.radians(0.2)
 _LOST = 0.5
 _LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.08, 0.35, 0.3
+_TURN_SHARE = 0.4
 _MARGIN, _BACKWARD = 0.9, 0.8
 """Shares of the acceleration limits planned with when braking, and between corners; the rest is for corrections."""
 _GRAZING = math.tan(math.radians(15.0)) ** 2
@@ -40,13 +41,14 @@ def _wrap(angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def vertex_speeds(path, max_speed, acceleration, turn_acceleration):  # type: ignore[no-untyped-def]
+def vertex_speeds(path, limits):  # type: ignore[no-untyped-def]
     """Highest speed (k,) at each vertex of a path (k, 2): 0 at sharp corners and at the end.
 
     A corner of angle a turned over a length l is cut by about l a / 8 in its middle; turning by a takes at least
-    2 sqrt(a / turn acceleration). Hence l = 8 cut / a, no longer than the legs, and speed l / time. A backward
-    pass makes every later limit reachable by braking.
+    2 sqrt(a / turn acceleration), and 2 a / turn rate. Hence l = 8 cut / a, no longer than the legs, and speed
+    l / time. A backward pass makes every later limit reachable by braking. limits as in `command`.
     """
+    max_speed, max_rate, acceleration, turn_acceleration = limits
     n = path.shape[0]
     out = np.zeros(n)
     for k in range(n - 2, -1, -1):
@@ -63,7 +65,10 @@ def vertex_speeds(path, max_speed, acceleration, turn_acceleration):  # type: ig
                 out[k] = max_speed
             elif turn < (0.005 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
                 length = min(8.0 * _CUT / turn, ahead, behind)
-                out[k] = min(max_speed, 0.5 * length * math.sqrt(0.6 * turn_acceleration / turn))
+                out[k] = min(
+                    max_speed,
+                    length * min(0.5 * math.sqrt(_TURN_SHARE * turn_acceleration / turn), 0.5 * max_rate / turn),
+                )
         out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * _BACKWARD * acceleration * ahead))
     return out
 
@@ -163,6 +168,8 @@ def command(state, path, speeds, heading, final_turn, limits, track, step):  # t
         if curvature != 0.0:
             wish = min(wish, max_rate / abs(curvature))
         wish = min(wish, max_speed / (1.0 + 0.5 * track * abs(curvature)))
+        # slow enough to turn towards the point before it is reached, as at the vertices
+        wish = min(wish, 0.5 * look * math.sqrt(_TURN_SHARE * turn_acceleration / max(abs(off), 1e-6)))
         state[SPEED] = max(0.0, _towards(state[SPEED], wish, acceleration * step))
         bound = min(max_rate, 2.0 * max(max_speed - state[SPEED], 0.0) / track)
         rate = min(max(curvature * state[SPEED], -bound), bound)

@@ -152,7 +152,7 @@ class World:
         state = np.zeros(8)
         state[:3] = self._pose
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
-        speeds = follower.vertex_speeds(path, robot.max_speed, robot.max_acceleration, robot.max_turn_acceleration)
+        speeds = follower.vertex_speeds(path, self._limits)
         steps = max(1, math.ceil(self.config.time_limit / step))
         engine: _Engine | None = None
         parts, done, collided = [self._pose[None].copy()], 0, False

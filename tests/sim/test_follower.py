@@ -1,0 +1,93 @@
+import math
+
+import numpy as np
+import pymunk
+import pytest
+import shapely
+
+from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
+from polyexplore_gym.sim import follower
+from polyexplore_gym.sim.world import World
+
+NO_WALLS = np.empty((0, 4))
+
+
+def random_path(rng: np.random.Generator, shortest: float, longest: float) -> np.ndarray:
+    points, heading = [np.zeros(2)], rng.uniform(-3, 3)
+    for _ in range(rng.integers(1, 8)):
+        points.append(points[-1] + rng.uniform(shortest, longest) * np.array([math.cos(heading), math.sin(heading)]))
+        heading += rng.normal(0, 0.3) if rng.random() < 0.5 else rng.uniform(-2.5, 2.5)
+    return np.array(points)
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    return np.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+@pytest.mark.parametrize(("shortest", "longest"), [(1.0, 4.0), (0.05, 0.6), (0.01, 0.15)])
+@pytest.mark.parametrize(
+    "robot", [RobotConfig(), RobotConfig(max_speed=0.5, max_turn_rate=1.0, max_turn_acceleration=2.0)]
+)
+def test_stays_on_the_path_within_the_limits(shortest: float, longest: float, robot: RobotConfig) -> None:
+    rng, step = np.random.default_rng(4), 0.04
+    for _ in range(60):
+        path, heading = random_path(rng, shortest, longest), rng.uniform(-3, 3)
+        world = World(NO_WALLS, robot, SensorConfig(), DriveConfig(), np.array([0, 0, rng.uniform(-3, 3)]))
+        result = world.drive(path, heading)
+        way = result.trajectory
+        assert result.arrived
+        assert not result.collided
+        assert result.duration == pytest.approx((len(way) - 1) * step)
+        assert shapely.distance(shapely.LineString(path), shapely.points(way[:, :2])).max() < 0.02
+        assert math.hypot(*(way[-1, :2] - path[-1])) < 0.01
+        assert abs(wrapped(way[-1, 2] - heading)) < math.radians(0.5)
+        speed = np.hypot(*np.diff(way[:, :2], axis=0).T) / step
+        rate = wrapped(np.diff(way[:, 2])) / step
+        assert (speed + np.abs(rate) * robot.track / 2).max() <= robot.max_speed + 1e-6  # the outer wheel
+        assert np.abs(rate).max() <= robot.max_turn_rate + 1e-6
+        assert np.abs(np.diff(speed, prepend=0.0)).max() <= robot.max_acceleration * step + 1e-6
+        assert np.abs(np.diff(rate, prepend=0.0)).max() <= robot.max_turn_acceleration * step + 1e-6
+        # the body moves where it points: no sideways slip
+        moved = speed > 1e-9
+        course = np.arctan2(*np.diff(way[:, :2], axis=0).T[::-1])
+        assert np.abs(wrapped(course - way[:-1, 2])[moved]).max() < 1e-5
+
+
+def test_free_motion_is_what_pymunk_integrates() -> None:
+    robot, step = RobotConfig(), 0.04
+    limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
+    path = np.array([[0.0, 0.0], [2.0, 0.3], [2.5, 1.5], [1.0, 3.0]])
+    speeds = follower.vertex_speeds(path, limits)
+    space = pymunk.Space()
+    body = pymunk.Body(robot.mass, 1.0)
+    space.add(body, pymunk.Circle(body, robot.radius))
+    state = np.zeros(8)
+    state[follower.PHASE] = follower.ALIGN
+    rows = []
+    while True:
+        follower.command(state, path, speeds, 1.0, True, limits, robot.track, step)
+        if state[follower.PHASE] >= follower.DONE:
+            break
+        body.velocity = state[follower.SPEED] * math.cos(body.angle), state[follower.SPEED] * math.sin(body.angle)
+        body.angular_velocity = state[follower.RATE]
+        space.step(step)
+        state[:3] = *body.position, body.angle
+        rows.append(state[:3].copy())
+    world = World(NO_WALLS, robot, SensorConfig(), DriveConfig(), np.zeros(3))
+    way = world.drive(path, 1.0).trajectory
+    assert len(way) == len(rows) + 1
+    np.testing.assert_allclose(way[1:, :2], np.array(rows)[:, :2], atol=1e-9)
+    np.testing.assert_allclose(wrapped(way[1:, 2] - np.array(rows)[:, 2]), 0.0, atol=1e-9)
+
+
+def test_vertex_speeds_leave_room_to_brake() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(100):
+        path = random_path(rng, 0.05, 3.0)
+        speeds = follower.vertex_speeds(path, (1.2, 3.0, 0.6, 5.0))
+        legs = np.hypot(*np.diff(path, axis=0).T)
+        turns = np.abs(wrapped(np.diff(np.arctan2(*np.diff(path, axis=0).T[::-1]))))
+        assert speeds[-1] == 0.0
+        assert (speeds[:-1] ** 2 <= speeds[1:] ** 2 + 2 * 0.6 * legs + 1e-9).all()
+        assert (speeds[1:-1][turns > math.radians(45)] == 0.0).all()
+        assert speeds.max() <= 1.2
