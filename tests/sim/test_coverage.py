@@ -43,7 +43,7 @@ def test_agrees_with_shapely_on_random_scenes(part: int) -> None:
 def test_all_of_a_convex_room_and_nothing_behind_its_walls() -> None:
     room = boxed(np.empty((0, 4)), 3.0)
     inside = np.stack(np.meshgrid(np.arange(-2.9, 3, 0.2), np.arange(-2.9, 3, 0.2)), -1).reshape(-1, 2)
-    outside = inside + [6.1, 0.0]
+    outside = inside + np.array([6.1, 0.0])
     coverage = Coverage(np.vstack([inside, outside]))
     sensor = SensorConfig(field_of_view=2 * math.pi, max_range=20.0)
     assert coverage.add(room, np.array([0.3, -0.4, 1.0]), sensor) == len(inside)

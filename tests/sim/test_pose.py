@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -52,9 +53,7 @@ def test_gaussian_errors_are_independent_with_the_reported_covariance() -> None:
 def test_odometry_covariance_is_consistent(dense: bool) -> None:
     drive = DRIVE
     if dense:  # the same drive in small steps, as the physics reports it
-        drive = np.concatenate(
-            [np.linspace(a, b, 40, endpoint=False) for a, b in zip(DRIVE[:-1], DRIVE[1:], strict=True)]
-        )
+        drive = np.concatenate([np.linspace(a, b, 40, endpoint=False) for a, b in itertools.pairwise(DRIVE)])
         drive = np.vstack([drive, DRIVE[-1]])
     rng = np.random.default_rng(2)
     config = PoseConfig(mode="odometry", drift_distance=0.02, drift_heading=0.02, drift_turn=0.01)
@@ -94,7 +93,7 @@ def test_odometry_variances_grow_as_stated() -> None:
 def test_odometry_without_noise_and_in_parts_is_the_truth() -> None:
     config = PoseConfig(mode="odometry", drift_distance=0.0, drift_heading=0.0, drift_turn=0.0)
     model = PoseModel(config, DRIVE[0], np.random.default_rng(0))
-    for a, b in zip(DRIVE[:-1], DRIVE[1:], strict=True):
+    for a, b in itertools.pairwise(DRIVE):
         model.moved(np.array([a, b]))
         np.testing.assert_allclose(error(model.estimate, b), 0.0, atol=1e-12)
 

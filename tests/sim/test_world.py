@@ -1,0 +1,242 @@
+import math
+import pickle
+
+import numpy as np
+import pytest
+import shapely
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+from sim_scenes import boxed, clear_point, lines_of, load_polygon, polygon_walls, random_walls, shared_plans
+
+from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
+from polyexplore_gym.errors import InvalidMotionError
+from polyexplore_gym.sim.world import World
+
+ROOM = boxed(np.empty((0, 4)), 5.0)
+RADIUS = RobotConfig().radius
+
+
+def make(mode: str, pose: tuple[float, float, float], walls: np.ndarray = ROOM, **drive: float) -> World:
+    config = DriveConfig(mode=mode, **drive)  # type: ignore[arg-type]
+    return World(walls, RobotConfig(), SensorConfig(), config, np.array(pose))
+
+
+def gaps(walls: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
+    return shapely.distance(lines_of(walls), shapely.points(trajectory[:, :2])) - RADIUS
+
+
+both_modes = pytest.mark.parametrize("mode", ["physics", "kinematic"])
+
+
+@both_modes
+def test_drives_to_the_end_of_a_path(mode: str) -> None:
+    world = make(mode, (0.0, 0.0, 0.0))
+    path = np.array([[0.0, 0.0], [2.0, 1.0], [2.0, 1.0], [3.0, -2.0]])
+    result = world.drive(path, 1.0)
+    assert result.arrived
+    assert not result.collided
+    assert result.distance == pytest.approx(shapely.LineString(path).length, rel=0.01)
+    np.testing.assert_allclose(world.pose, [3.0, -2.0, 1.0], atol=0.009)
+    np.testing.assert_array_equal(result.trajectory[0], [0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(result.trajectory[-1], world.pose)
+    assert result.distance == pytest.approx(np.hypot(*np.diff(result.trajectory[:, :2], axis=0).T).sum())
+
+
+def test_kinematic_duration_is_the_sum_of_its_trapezoids() -> None:
+    robot = RobotConfig()
+    world = make("kinematic", (0.0, 0.0, 0.0))
+    result = world.drive(np.array([[0.0, 0.0], [4.0, 0.0]]), math.pi / 2)
+    ahead = 4.0 / robot.max_speed + robot.max_speed / robot.max_acceleration
+    turn = 2 * math.sqrt(math.pi / 2 / robot.max_turn_acceleration)  # too short to reach the top rate
+    assert result.duration == pytest.approx(ahead + turn)
+    np.testing.assert_allclose(world.pose, [4.0, 0.0, math.pi / 2])
+
+
+@both_modes
+def test_turns_on_the_spot_and_stands_still(mode: str) -> None:
+    world = make(mode, (1.0, 2.0, 3.0))
+    result = world.drive(np.array([[1.0, 2.0]]), -3.0)  # the short way, across the seam
+    assert result.arrived
+    assert result.distance == 0.0
+    assert abs(math.remainder(world.pose[2] + 3.0, 2 * math.pi)) < math.radians(0.5)
+    assert result.duration < 1.0
+    pose = world.pose
+    assert world.drive(np.array([[1.0, 2.0]])).duration <= 0.04
+    np.testing.assert_allclose(world.pose, pose, atol=1e-3)
+
+
+@both_modes
+@pytest.mark.parametrize("degrees", [90, 60, 35])
+def test_bump_stops_the_drive_and_the_robot_can_leave(mode: str, degrees: float) -> None:
+    world = make(mode, (4.0, 0.0, 0.0))
+    angle = math.radians(90 - degrees)
+    ahead = np.array([math.cos(angle), math.sin(angle)])
+    result = world.drive(np.array([[4.0, 0.0], np.array([4.0, 0.0]) + 3.0 * ahead]), 2.0)
+    assert result.collided
+    assert not result.arrived
+    contact = 0.75 / ahead[0] * ahead + [4.0, 0.0]
+    assert math.hypot(*(world.pose[:2] - contact)) < 0.08
+    assert 0.0 <= gaps(ROOM, world.pose[None])[0] < 1.1e-3
+    # on the spot it may turn, into the wall it may not drive, away it may
+    assert world.drive(world.pose[None, :2], 0.0).arrived
+    again = world.drive(np.array([world.pose[:2], world.pose[:2] + np.array([1.0, 0.0])]))
+    assert again.collided
+    assert again.distance < 0.01
+    back = world.drive(np.array([world.pose[:2], [2.0, -1.0]]), 0.5)
+    assert back.arrived
+    assert not back.collided
+
+
+def test_grazing_along_a_wall_is_no_bump() -> None:
+    world = make("physics", (0.0, -4.75, 0.0))
+    result = world.drive(np.array([[0.0, -4.75], [3.0, -4.78]]))  # 3 cm into the wall over 3 m
+    assert result.arrived
+    assert not result.collided
+    assert gaps(ROOM, result.trajectory).min() > -6e-3
+    assert gaps(ROOM, world.pose[None])[0] >= -1e-5
+
+
+@both_modes
+@pytest.mark.parametrize("fast", [False, True])
+def test_never_stands_in_a_wall_whatever_it_is_told(mode: str, fast: bool) -> None:
+    rng = np.random.default_rng(5)
+    robot = RobotConfig(max_speed=3.0, max_acceleration=3.0) if fast else RobotConfig()
+    bumps = 0
+    for _ in range(12):
+        walls = boxed(random_walls(rng, 25, side=12.0), 7.0)
+        start = clear_point(rng, walls, 6.0, RADIUS)
+        world = World(walls, robot, SensorConfig(), DriveConfig(mode=mode), np.array([*start, 0.0]))  # type: ignore[arg-type]
+        for k in range(20):
+            pose = world.pose
+            path = np.vstack([pose[:2], pose[:2] + np.cumsum(rng.uniform(-3, 3, (1 + k % 3, 2)), axis=0)])
+            result = world.drive(path, rng.uniform(-3, 3) if k % 2 else None)
+            bumps += result.collided
+            assert gaps(walls, world.pose[None])[0] > -1e-3
+            assert gaps(walls, result.trajectory).min() > -6e-3
+            assert not (result.collided and result.arrived)
+            assert result.collided or result.arrived  # nothing else ends a drive, and none hangs
+    assert bumps > 50
+
+
+@both_modes
+def test_time_limit_gives_up_where_it_stands(mode: str) -> None:
+    world = make(mode, (-4.0, 0.0, 0.0), time_limit=2.0)
+    result = world.drive(np.array([[-4.0, 0.0], [4.0, 0.0]]), 1.0)
+    assert result.duration == pytest.approx(2.0)
+    assert not result.arrived
+    assert not result.collided
+    assert result.distance == pytest.approx(1.2, abs=0.05)  # half of 0.6 m/s2 over 2 s squared
+    world = make(mode, (-4.0, 0.0, 0.0), time_limit=0.4)
+    assert not world.drive(np.array([[-4.0, 0.0]]), 3.0).arrived
+    assert 0.0 < world.pose[2] < 0.5
+
+
+@both_modes
+def test_drives_repeat_also_through_pickle(mode: str) -> None:
+    rng = np.random.default_rng(9)
+    walls = boxed(random_walls(rng, 20, side=9.0), 5.0)
+    start = clear_point(rng, walls, 4.0, RADIUS)
+    first = make(mode, (*start, 0.0), walls)
+    goals = rng.uniform(-4, 4, (10, 2))
+    second = make(mode, (*start, 0.0), walls)
+    for goal in goals:
+        a = first.drive(np.array([first.pose[:2], goal]))
+        second = pickle.loads(pickle.dumps(second))
+        b = second.drive(np.array([second.pose[:2], goal]))
+        np.testing.assert_array_equal(a.trajectory, b.trajectory)
+
+
+@both_modes
+def test_bad_input_is_refused(mode: str) -> None:
+    world = make(mode, (0.0, 0.0, 0.0))
+    for path in (np.empty((0, 2)), np.zeros((2, 3)), np.array([[0.0, 0.0], [np.nan, 1.0]])):
+        with pytest.raises(InvalidMotionError, match="path of shape"):
+            world.drive(path)
+    with pytest.raises(InvalidMotionError, match="path starts"):
+        world.drive(np.array([[0.1, 0.0], [1.0, 0.0]]))
+    with pytest.raises(InvalidMotionError, match="heading"):
+        world.drive(np.zeros((1, 2)), math.nan)
+    with pytest.raises(InvalidMotionError, match="from a wall"):
+        make(mode, (4.9, 0.0, 0.0))
+    with pytest.raises(InvalidMotionError, match="start pose"):
+        make(mode, (0.0, math.inf, 0.0))
+    for walls in (np.zeros((3, 2)), np.full((1, 4), np.nan)):
+        with pytest.raises(InvalidMotionError, match="walls"):
+            make(mode, (0.0, 0.0, 0.0), walls)
+    np.testing.assert_array_equal(world.pose, np.zeros(3))
+    with pytest.raises(ValueError, match="read-only"):
+        world.segments[0, 0] = 1.0
+
+
+def test_measures_from_where_it_stands() -> None:
+    world = World(
+        ROOM, RobotConfig(), SensorConfig(sigma_range=0.0, sigma_angle=0.0), DriveConfig(), np.array([1.0, 0, 0])
+    )
+    assert world.measure(np.random.default_rng(0))[180] == pytest.approx(4.0)
+    world.drive(np.array([[1.0, 0.0], [2.0, 0.0]]))
+    assert world.measure(np.random.default_rng(0))[180] == pytest.approx(5.0 - world.pose[0])
+
+
+class Planner:
+    """Shortest grid paths, pulled straight, that leave the disc a spare clearance."""
+
+    def __init__(self, polygon: shapely.Polygon, spare: float, step: float = 0.25) -> None:
+        self.free = polygon.buffer(-(RADIUS + spare))
+        shapely.prepare(self.free)
+        x0, y0, x1, y1 = polygon.bounds
+        x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
+        inside = shapely.contains_xy(self.free, x, y)
+        index = np.full(inside.shape, -1)
+        index[inside] = np.arange(inside.sum())
+        self.points = np.stack([x[inside], y[inside]], axis=1)
+        pairs = []
+        for a, b in (
+            (index[:, :-1], index[:, 1:]),
+            (index[:-1], index[1:]),
+            (index[:-1, :-1], index[1:, 1:]),
+            (index[:-1, 1:], index[1:, :-1]),
+        ):
+            keep = (a >= 0) & (b >= 0)
+            pairs.append(np.stack([a[keep], b[keep]], axis=1))
+        joined = np.concatenate(pairs)
+        joined = joined[shapely.covers(self.free, shapely.linestrings(self.points[joined]))]
+        lengths = np.hypot(*(self.points[joined[:, 0]] - self.points[joined[:, 1]]).T)
+        self.graph = coo_matrix((lengths, joined.T), shape=(len(self.points),) * 2).tocsr()
+
+    def path(self, source: int, target: int) -> np.ndarray | None:
+        reach, before = dijkstra(self.graph, directed=False, indices=source, return_predecessors=True)
+        if not np.isfinite(reach[target]) or source == target:
+            return None
+        chain = [target]
+        while chain[-1] != source:
+            chain.append(before[chain[-1]])
+        way, out, at = self.points[chain[::-1]], [0], 0
+        while at < len(way) - 1:
+            at += 1
+            while at + 1 < len(way) and self.free.covers(shapely.LineString(way[[out[-1], at + 1]])):
+                at += 1
+            out.append(at)
+        return way[out]
+
+
+@pytest.mark.skipif(not shared_plans(), reason="no shared floor plans here")
+def test_kinematic_distances_follow_the_physical_ones_on_shared_plans() -> None:
+    rng, ratios = np.random.default_rng(6), []
+    for file in shared_plans()[:50:7]:
+        polygon = load_polygon(file)
+        walls, planner = polygon_walls(polygon), Planner(polygon, 0.035)
+        for _ in range(6):
+            path = planner.path(*rng.integers(0, len(planner.points), 2))
+            if path is None:
+                continue
+            pose, heading = (*path[0], rng.uniform(-3, 3)), rng.uniform(-3, 3)
+            results = [make(mode, pose, walls).drive(path, heading) for mode in ("physics", "kinematic")]
+            for result in results:
+                assert result.arrived, file.name
+                assert not result.collided, file.name
+            assert shapely.distance(shapely.LineString(path), shapely.points(results[0].trajectory[:, :2])).max() < 0.02
+            assert gaps(walls, results[0].trajectory).min() > 0.0
+            ratios.append(results[0].distance / results[1].distance)
+    assert len(ratios) > 20
+    assert min(ratios) > 0.99
+    assert max(ratios) < 1.001
