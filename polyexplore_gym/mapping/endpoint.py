@@ -99,7 +99,14 @@ def split(x: np.ndarray, y: np.ndarray, run: np.ndarray, var_range: float, var_a
 
 @njit(cache=True)
 def fit_piece(
-    x: np.ndarray, y: np.ndarray, order: np.ndarray, lo: int, hi: int, var_range: float, var_angle: float, out: np.ndarray
+    x: np.ndarray,
+    y: np.ndarray,
+    order: np.ndarray,
+    lo: int,
+    hi: int,
+    var_range: float,
+    var_angle: float,
+    out: np.ndarray,
 ) -> None:
     """Fit returns lo..hi roughly into out = lo, hi, rho, alpha, var_alpha, cov, var_rho, chi-square."""
     out[0], out[1] = lo, hi

@@ -12,6 +12,7 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping.endpoint import endpoint_labels
 from polyexplore_gym.mapping.fragments import fragment_chains
 from polyexplore_gym.mapping.grouping import UNDECIDED, attach, cut, fit_labels, group_collinear
+from polyexplore_gym.mapping.hough import hough_labels
 
 COLLINEAR_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
 LEAST_RANGE_NOISE = 1e-3  # m; a noise-free sensor is fitted with these, so that weights stay finite
@@ -88,9 +89,12 @@ def extract_lines(
     start, points = _returns(angles, ranges, sensor.max_range, sensor.full_circle)
     resolution = (angles[-1] - angles[0]) / (angles.size - 1) if angles.size > 1 else sensor.resolution
     x, y, beam_of, reach_of, cos_t, sin_t = points
-    label, count = endpoint_labels(
-        x, y, beam_of, resolution, sigma_range**2, sigma_angle**2, config.min_points, config.min_length
-    )
+    noise = sigma_range**2, sigma_angle**2
+    limits = config.min_points, config.min_length
+    if config.start == "hough":
+        label, count = hough_labels(x, y, *noise, *limits, config.door_width)
+    else:
+        label, count = endpoint_labels(x, y, beam_of, resolution, *noise, *limits)
     return ScanLines(
         *_assemble(
             x, y, beam_of, reach_of, cos_t, sin_t, start, sensor.max_range, resolution, label, count,
