@@ -12,11 +12,13 @@ import shapely
 import shapely.affinity
 
 from polyexplore_gym.floorplan import offices
-from polyexplore_gym.floorplan.building import Cell, finish
+from polyexplore_gym.floorplan.building import Cell, finish, within
 from polyexplore_gym.floorplan.model import FloorPlan
 
 AREA_RANGE = (40.0, 2500.0)
 """Free area of an angled plan, m2."""
+VERTEX_RANGE = (30, 900)
+"""Vertices of an angled plan."""
 _STEP = math.radians(6.0)
 _SPACE = 750
 
@@ -35,7 +37,7 @@ def draw_angled(rng: np.random.Generator, name: str, meta: dict[str, Any]) -> Fl
     # Half a centimetre is less than any wall; it removes the slivers of nearly equal directions.
     free = shapely.simplify(_turned(free, turn), 5.0, preserve_topology=True)
     plan = finish(free, [_turned(item, turn) for item in obstacles], name, {**meta, "style": style})
-    return plan if plan is not None and AREA_RANGE[0] <= plan.area <= AREA_RANGE[1] else None
+    return within(plan, AREA_RANGE, VERTEX_RANGE)
 
 
 def _turned(geometry: Any, degrees: float) -> Any:
@@ -92,7 +94,7 @@ def _wings(rng: np.random.Generator) -> tuple[Any, list[Any]] | None:
         length = int(rng.integers(900, 2400)) * 10
         cells = [Cell((0, 0, length, width), "corridor")]
         for low, high in ((width, width + up), (-down, 0)):
-            cells += [Cell((a, low, b, high)) for a, b in offices._row(rng, length, high - low)]
+            cells += [Cell((a, low, b, high)) for a, b in offices.room_row(rng, length, high - low)]
         built = offices.build(rng, cells, thickness)
         if built is None:
             return None

@@ -175,6 +175,13 @@ def finish(free: Any, obstacles: Sequence[Any], name: str, meta: dict[str, Any])
         return None
 
 
+def within(plan: FloorPlan | None, area: tuple[float, float], vertices: tuple[int, int]) -> FloorPlan | None:
+    """The plan if its area (m2) and number of vertices lie in the ranges, else None."""
+    if plan is None or not area[0] <= plan.area <= area[1] or not vertices[0] <= plan.n_vertices <= vertices[1]:
+        return None
+    return plan
+
+
 def _single(geometry: Any) -> Any:
     """The geometry if it is one polygon."""
     return geometry if geometry.geom_type == "Polygon" and not geometry.is_empty else None

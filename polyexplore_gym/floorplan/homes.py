@@ -19,11 +19,14 @@ from polyexplore_gym.floorplan.building import (
     shared_walls,
     spanning_walls,
     union_of,
+    within,
 )
 from polyexplore_gym.floorplan.model import FloorPlan
 
 AREA_RANGE = (30.0, 320.0)
 """Free area of a home, m2."""
+VERTEX_RANGE = (24, 260)
+"""Vertices of a home."""
 _DOORS = (800, 850, 900, 900, 950, 1000, 1200)
 _MIN_SIDE = 1700
 
@@ -51,7 +54,7 @@ def draw_home(rng: np.random.Generator, name: str, meta: dict[str, Any]) -> Floo
         bevelled = float(rng.choice([0.0, 0.2, 0.5]))
         obstacles += _furnish(rng, cells, rooms, doors + merged, bevelled)
     plan = finish(free, obstacles, name, meta)
-    return plan if plan is not None and AREA_RANGE[0] <= plan.area <= AREA_RANGE[1] else None
+    return within(plan, AREA_RANGE, VERTEX_RANGE)
 
 
 def _split(rng: np.random.Generator, box: Box, limit: float, cells: list[Cell], kind: str = "room") -> None:

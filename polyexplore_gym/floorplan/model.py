@@ -27,7 +27,7 @@ _QUAD_SEGMENTS = 16
 _HASH_UNIT = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FloorPlan:
     """An immutable floor plan: the free space within `exterior` and outside of `holes`.
 
@@ -77,6 +77,9 @@ class FloorPlan:
             ring.setflags(write=False)
         for key, value in (("name", name), ("exterior", exterior), ("holes", holes), ("meta", MappingProxyType(meta))):
             object.__setattr__(self, key, value)
+
+    def __repr__(self) -> str:
+        return f"FloorPlan({self.name!r}, {self.area:.1f} m2, {self.n_vertices} vertices, {len(self.holes)} holes)"
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, FloorPlan):

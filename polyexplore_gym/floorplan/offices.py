@@ -20,11 +20,14 @@ from polyexplore_gym.floorplan.building import (
     shared_walls,
     spanning_walls,
     union_of,
+    within,
 )
 from polyexplore_gym.floorplan.model import FloorPlan
 
 AREA_RANGE = (250.0, 3600.0)
 """Free area of an office, m2."""
+VERTEX_RANGE = (120, 1000)
+"""Vertices of an office."""
 _DOORS = (850, 900, 900, 950, 1000)
 _DOUBLE_DOORS = (1200, 1400, 1600)
 
@@ -38,7 +41,7 @@ def draw_office(rng: np.random.Generator, name: str, meta: dict[str, Any]) -> Fl
         return None
     free, obstacles = built
     plan = finish(free, obstacles, name, meta)
-    return plan if plan is not None and AREA_RANGE[0] <= plan.area <= AREA_RANGE[1] else None
+    return within(plan, AREA_RANGE, VERTEX_RANGE)
 
 
 def build(rng: np.random.Generator, cells: list[Cell], thickness: int) -> tuple[Any, list[Any]] | None:
@@ -124,7 +127,7 @@ def _block(rng: np.random.Generator, box: Box, sides: tuple[bool, bool, bool, bo
         cuts.insert(1, int(across * rng.uniform(0.4, 0.6)))
     cells = []
     for low, high in pairwise(cuts):
-        for start, end in _row(rng, length, high - low):
+        for start, end in room_row(rng, length, high - low):
             for a, b in _in_depth(rng, start, end, low, high):
                 part = (start, a, end, b) if along_x else (a, start, b, end)
                 cells.append(Cell((x0 + part[0], y0 + part[1], x0 + part[2], y0 + part[3])))
@@ -142,7 +145,7 @@ def _set_back(rng: np.random.Generator, box: Box, sides: tuple[bool, bool, bool,
     return bounds[0], bounds[1], bounds[2], bounds[3]
 
 
-def _row(rng: np.random.Generator, length: int, depth: int) -> list[tuple[int, int]]:
+def room_row(rng: np.random.Generator, length: int, depth: int) -> list[tuple[int, int]]:
     """Cut a row of rooms: cell offices of one width, mixed widths, or large rooms."""
     style = rng.random()
     module = int(rng.integers(260, 400)) * 10
@@ -171,7 +174,10 @@ def _in_depth(rng: np.random.Generator, start: int, end: int, low: int, high: in
 def _openings(
     rng: np.random.Generator, cells: list[Cell], thickness: int
 ) -> tuple[list[Cell], list[Box], list[Box]] | None:
-    """Doors and open passages; rooms without a neighbour to go through become solid."""
+    """The cells that can be reached, their doors, and open passages; the other rooms stay solid.
+
+    None if the corridors are not connected.
+    """
     walls = shared_walls(cells, thickness + 1050)
     hub = next(i for i, c in enumerate(cells) if c.kind == "corridor")
     corridor_walls = [w for w in walls if cells[w.a].kind == cells[w.b].kind == "corridor"]
@@ -196,14 +202,13 @@ def _openings(
     for wall in tree:
         doors.append(_door(rng, wall, cells, thickness))
     for wall in walls:
-        if wall in tree or wall in corridor_walls:
+        if wall in tree or wall in corridor_walls or wall.a not in reached:
             continue
         kinds = cells[wall.a].kind, cells[wall.b].kind
         large = max(cells[wall.a].area, cells[wall.b].area) > 45
         chance = (0.7 if large else 0.05) if "corridor" in kinds else 0.05
         if rng.random() < chance:
             doors.append(_door(rng, wall, cells, thickness))
-    # Now and then an unused room is a shaft, and what cannot be reached is solid, too.
     return [c for i, c in enumerate(cells) if i in reached], doors, merged
 
 

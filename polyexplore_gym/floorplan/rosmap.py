@@ -261,6 +261,8 @@ def _read_image(path: Path) -> tuple[np.ndarray, np.ndarray]:
     except OSError as error:
         raise InvalidFloorPlanError(f"image {path}: cannot be read: {error.strerror or error}") from error
     _check_complete(data, path)
+    if data[:2] in (b"P1", b"P2", b"P3"):
+        data += b"\n"  # OpenCV wants white space after the last number, too.
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     except cv2.error:
@@ -283,8 +285,8 @@ def _check_complete(data: bytes, path: Path) -> None:
     """OpenCV fills a truncated file's missing rows without a word: look for the end."""
     truncated = False
     if data[:8] == b"\x89PNG\r\n\x1a\n":
-        truncated = b"IEND" not in data[-16:]
-    elif data[:2] == b"P5":
+        truncated = b"IEND\xaeB`\x82" not in data
+    elif data[:2] in (b"P5", b"P6"):
         header: list[int] = []
         position = 2
         while len(header) < 3 and position < len(data):
@@ -299,10 +301,11 @@ def _check_complete(data: bytes, path: Path) -> None:
                     end += 1
                 word = data[position:end]
                 if not word.isdigit() or len(word) > 9:
-                    raise InvalidFloorPlanError(f"image {path}: damaged PGM header")
+                    raise InvalidFloorPlanError(f"image {path}: damaged PNM header")
                 header.append(int(word))
                 position = end
-        size = header[0] * header[1] * (2 if header[2] > 255 else 1) if len(header) == 3 else math.inf
+        channels = 3 if data[:2] == b"P6" else 1
+        size = header[0] * header[1] * channels * (2 if header[2] > 255 else 1) if len(header) == 3 else math.inf
         truncated = len(data) - position - 1 < size
     if truncated:
         raise InvalidFloorPlanError(f"image {path}: the file is truncated")

@@ -32,6 +32,21 @@ _SPLITS = {"train": (TRAIN_SEEDS, 1000), "validation": (VALIDATION_SEEDS, 30), "
 # Mixed suites take the first plans of the families' suites, in turn.
 _MIXED_SIZES = {"train": 333, "validation": 10, "test": 17}
 _ATTEMPTS = 100
+CONTENT_HASHES = {
+    "angled-test": "6f18f38bb0010f6f6d50617bbf70cf12147ec9191f659ee9e0b7a9bb76b48b08",
+    "angled-train": "40c1700c6f735260c6e2cf74672759b11690f7aee927722d8ae9443edeb8a477",
+    "angled-validation": "cbbce6550a65552b71d90da54cd94f12fb7b1b50ff7e9b06123342f93cc3b8c2",
+    "home-test": "3e8cfb5603ce64b797219aa7a4f93094708d355960e9ecc9359b9259395fb304",
+    "home-train": "a7566b865f3d9c4c28357133bca3f50d4980c67df13e729fe1e4df08ceef3825",
+    "home-validation": "2103975bf053eaa464a0e92e2729bf4f19ff6ba482c73847853e4097a188e734",
+    "mixed-test": "af919d7db73c3e39dbaf9fbf1c6a3419e975ea87a5b411a409d06ee3b759a2a7",
+    "mixed-train": "90ffc347eca8b15f183d7e97826bab88ad0a77f46bc837208d7a5bc67e85d852",
+    "mixed-validation": "7d4977b957dc07b8cb5401e10fb3552008552fcb7f923a7eb515e7bcb28a1822",
+    "office-test": "8f16936e564ef20765f2c3c5c40359b1699e1a45dcc0d0e9c7e8fcc10dbc2e72",
+    "office-train": "a9787fec32222d7e585b91e7b76c70765f09738932821a1be47150209e468d8f",
+    "office-validation": "dd1e2c887a614689003e52d34e213836c119daefa6ac4ee0847b032aa4558419",
+}
+"""The suites' content hashes; results under other hashes are not comparable. A test compares them."""
 
 
 @lru_cache(maxsize=128, typed=True)
