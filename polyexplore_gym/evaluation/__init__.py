@@ -1,8 +1,8 @@
 """Comparing policies: episodes, results on disk, statistics, tables and plots.
 
-    study = Study(policies=name_policies(["nearest", "my.module:MyPolicy"]), plans=suite("home-test").plans())
-    records = evaluate(study, out="results/mine", workers=4)
-    print(summary_text(summarize(records, np.random.default_rng(0))))
+study = Study(policies=name_policies(["nearest", "my.module:MyPolicy"]), plans=suite("home-test").plans())
+records = evaluate(study, out="results/mine", workers=4)
+print(summary_text(summarize(records, np.random.default_rng(0))))
 """
 
 from polyexplore_gym.evaluation.episode import run_episode

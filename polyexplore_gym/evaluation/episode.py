@@ -9,14 +9,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from polyexplore_gym.config import EnvConfig
 from polyexplore_gym.evaluation.policy import Policy
 from polyexplore_gym.evaluation.records import THRESHOLDS, EpisodeRecord
 
 _POLICY_STREAM = 0x706F6C69637900
 """Keeps the policy's random numbers apart from those of the environment, which has the same seed."""
 
-Observer = Callable[[gymnasium.Env, Mapping[str, Any], bool], None]
-"""Called with the environment, the info and whether the episode is over: after reset and every step."""
+Observer = Callable[[gymnasium.Env, Mapping[str, Any], int | None, bool], None]
+"""Called after the reset and every step: environment, info, the action taken, whether the episode is over."""
 
 
 def policy_rng(seed: int, plan_hash: str) -> np.random.Generator:
@@ -31,8 +32,6 @@ def run_episode(
     seed: int,
     *,
     label: str,
-    placement: str,
-    drive: str,
     options: Mapping[str, Any] | None = None,
     observer: Observer | None = None,
 ) -> EpisodeRecord:
@@ -44,11 +43,10 @@ def run_episode(
         plan: the `FloorPlan`.
         seed: of the environment; start and noise follow from it.
         label: the policy's name in the record.
-        placement: for the record.
-        drive: for the record.
         options: more options of the reset, such as `start`.
         observer: called after the reset and after every step.
     """
+    config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
     log = _Log()
     status, error = "failed", None
     began = time.perf_counter()
@@ -60,13 +58,13 @@ def run_episode(
     reached = dict(zip(THRESHOLDS, log.distances_to_coverage(), strict=True))
     return EpisodeRecord(
         policy=label,
-        placement=placement,
+        placement=config.exploration.placement,
         plan=str(plan.name),
         plan_hash=plan.content_hash,
         group=building(plan),
         stratum=str(plan.meta.get("kind") or plan.meta.get("family") or ""),
         seed=seed,
-        drive=drive,
+        drive=config.drive.mode,
         status=status,
         error=error,
         distance=round(log.distance[-1], 6) if log.distance else 0.0,
@@ -109,10 +107,11 @@ def _play(
         forget()
     observation, info = env.reset(seed=seed, options={**options, "plan": plan})
     log.add(info)
+    action = None
     terminated = truncated = not np.any(info["action_mask"])  # all was seen from the start
     while True:
         if observer is not None:
-            observer(env, info, terminated or truncated)
+            observer(env, info, action, terminated or truncated)
         if terminated or truncated:
             return "complete" if terminated else "truncated"
         began = time.perf_counter()

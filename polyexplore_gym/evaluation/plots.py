@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,11 @@ import numpy as np
 from polyexplore_gym.config import EnvConfig
 from polyexplore_gym.errors import MissingDependencyError, ResultsError
 from polyexplore_gym.evaluation.episode import run_episode
-from polyexplore_gym.evaluation.policy import PolicySpec, load_policy, policy_label
+from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
 from polyexplore_gym.evaluation.statistics import coverage_at, resampled_weights
-from polyexplore_gym.evaluation.summary import Comparison, Summary
+from polyexplore_gym.evaluation.summary import Comparison, Summary, completed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,9 +43,10 @@ def coverage_figure(
     policies = list(dict.fromkeys(r.policy for r in records))
     figure = _figure(4.6 * len(placements) + 0.4, 3.9)
     grid = np.linspace(0.0, 1.6, 161)
+    done = completed(records)
     panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
     for panel, placement in zip(panels, placements, strict=True):
-        found = {(r.policy, r.plan_hash, r.seed): r for r in records if r.placement == placement and r.complete}
+        found = {(r.policy, r.plan_hash, r.seed): r for r in done if r.placement == placement}
         compared = [p for p in policies if any(key[0] == p for key in found)]
         base = reference if reference in compared else next(iter(compared), "")
         pairs = [
@@ -110,7 +111,7 @@ def ratio_figure(summary: Summary) -> Figure:
 
 
 def trajectory_figure(
-    policies: Sequence[PolicySpec],
+    policies: Mapping[str, PolicySpec],
     plan: Any,
     seed: int,
     config: EnvConfig,
@@ -124,44 +125,37 @@ def trajectory_figure(
     """
     from polyexplore_gym.rendering import draw
 
-    columns = min(len(policies), 4 if _wide(plan) < 1.6 else 2)
+    shape = _shape(plan)
+    columns = min(len(policies), 4 if shape > 0.6 else 3 if shape > 0.4 else 2)
     rows = -(-len(policies) // columns)
-    width = 3.6 if columns > 2 else 5.4
-    figure = _figure(width * columns, (width / _wide(plan) + 0.75) * rows)
-    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    width = 14.0 / max(columns, 3)
+    height = width * shape + 0.35  # inches, with the line above the map
+    figure = _figure(width * columns, height * rows)
+    figure.set_layout_engine("none")
     env = make_env(config)
-    for panel, spec in zip(panels, policies, strict=False):
-        label = policy_label(spec)
-        snapshot, record = replay(env, spec, plan, seed, config)
+    for i, (label, spec) in enumerate(policies.items()):
+        left, top = (i % columns) / columns, 1.0 - (i // columns) / rows
+        box = (left + 0.02 / columns, top - 0.99 / rows, 0.96 / columns, (0.98 - 0.35 / height) / rows)
+        panel = figure.add_axes(box)
+        snapshot, record = replay(env, load_policy(spec), plan, seed, label=label)
         draw(snapshot, panel, scale_bar=False, text=False)
         ended = "" if record.complete else f", {record.status}"
         panel.set_title(f"{label}: {record.distance:.0f} m, {record.measurements} scans{ended}", fontsize=9, color=_INK)
-    for panel in panels[len(policies) :]:
-        panel.set_axis_off()
     env.close()
     return figure
 
 
-def replay(env: Any, spec: PolicySpec, plan: Any, seed: int, config: EnvConfig) -> tuple[Any, EpisodeRecord]:
+def replay(env: Any, policy: Policy, plan: Any, seed: int, *, label: str) -> tuple[Any, EpisodeRecord]:
     """The last snapshot of an episode that is run again, and its record; raises `ResultsError` if it fails."""
-    last: list[Any] = [None]
+    last: list[Any] = []
 
-    def observe(env: Any, info: Any, over: bool) -> None:
+    def observe(env: Any, info: Any, action: int | None, over: bool) -> None:
         if over:
-            last[0] = env.unwrapped.snapshot()
+            last.append(env.unwrapped.snapshot())
 
-    record = run_episode(
-        env,
-        load_policy(spec),
-        plan,
-        seed,
-        label=policy_label(spec),
-        placement=config.exploration.placement,
-        drive=config.drive.mode,
-        observer=observe,
-    )
-    if last[0] is None:
-        raise ResultsError(f"{policy_label(spec)} on {plan.name} (seed {seed}): {record.error}")
+    record = run_episode(env, policy, plan, seed, label=label, observer=observe)
+    if not last:
+        raise ResultsError(f"{label} on {plan.name} (seed {seed}): {record.error}")
     return last[0], record
 
 
@@ -200,6 +194,7 @@ def _versus(c: Comparison) -> str:
     return f"{c.ours[1]} / {c.theirs[1]}, {c.ours[0]}"
 
 
-def _wide(plan: Any) -> float:
+def _shape(plan: Any) -> float:
+    """Height over width of a plan's picture."""
     x0, y0, x1, y1 = plan.bounds
-    return float(np.clip((x1 - x0) / (y1 - y0), 0.4, 3.0))
+    return float(np.clip((y1 - y0) / (x1 - x0), 0.2, 1.5))

@@ -222,8 +222,6 @@ def _run_task(task: Task, make_env: MakeEnv) -> EpisodeRecord:
         _same_plan(task.plan),
         task.seed,
         label=task.label,
-        placement=task.config.exploration.placement,
-        drive=task.config.drive.mode,
     )
     if record.status == "failed":
         _env.cache_clear()  # whatever state it was left in

@@ -2,8 +2,10 @@
 
 Failed and truncated episodes are counted, never averaged in: a policy that gives up early has driven
 little. Means, and everything that compares, use only the (plan, seed) pairs that all policies
-completed at that placement; how many those are is part of the result. A policy that completed
-nothing at a placement is left out of its comparison, so that it does not leave the others nothing.
+completed at that placement; how many those are is part of the result. An episode that ended of
+itself but saw less than another one on the same plan (by more than `SHORTFALL`) stopped short: it is
+counted apart too, or giving up early would look like exploring fast. A policy that completed nothing
+at a placement is left out of its comparison, so that it does not leave the others nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from polyexplore_gym.errors import ResultsError
-from polyexplore_gym.evaluation.records import EpisodeRecord
+from polyexplore_gym.evaluation.records import EpisodeRecord, Key
 from polyexplore_gym.evaluation.statistics import (
     Interval,
     area_under_coverage,
@@ -29,6 +31,9 @@ from polyexplore_gym.evaluation.statistics import (
     signed_rank_p,
 )
 
+SHORTFALL = 0.02
+"""Share of the free area by which an episode may stay behind the most that was seen on the plan and be complete."""
+
 Pair = tuple[str, int]
 """Plan hash and seed: one start on one plan."""
 
@@ -37,6 +42,7 @@ METRICS: dict[str, Callable[[EpisodeRecord], float | None]] = {
     "distance_90": lambda r: r.distance_90,
     "distance_95": lambda r: r.distance_95,
     "distance_99": lambda r: r.distance_99,
+    "coverage": lambda r: r.coverage,
     "measurements": lambda r: r.measurements,
     "sim_time": lambda r: r.sim_time,
     "collisions": lambda r: r.collisions,
@@ -62,6 +68,7 @@ class Row:
     placement: str
     episodes: int
     complete: int
+    short: int
     truncated: int
     failed: int
     metrics: dict[str, Metric]
@@ -98,7 +105,7 @@ class Summary:
     rows: list[Row]
     """By placement, the shortest mean distance first."""
     against_reference: list[Comparison]
-    """Every other policy against the reference, at the same placement."""
+    """Every other policy against the reference, at the same placement; the best ratio first, as below."""
     between_placements: list[Comparison]
     """Every policy at every further placement against itself at the first one."""
     notes: list[str]
@@ -135,7 +142,7 @@ def summarize(
     if reference not in policies:
         reference = policies[0]
     by_key = {(r.policy, r.placement, (r.plan_hash, r.seed)): r for r in records}
-    table = _Table(by_key, rng, resamples, confidence)
+    table = _Table(by_key, {r.key for r in completed(records)}, rng, resamples, confidence)
 
     rows: list[Row] = []
     against: list[Comparison] = []
@@ -154,7 +161,7 @@ def summarize(
         if reference in compared:
             sides = [((p, placement), (reference, placement)) for p in others]
             against += table.compare(sides, [common[placement]] * len(sides))
-    between = []
+    between: list[Comparison] = []
     for placement in placements[1:]:
         sides = [((p, placement), (p, placements[0])) for p in policies]
         pairs = [_common_pairs(table.completed(*side) for side in two) for two in sides]
@@ -163,22 +170,34 @@ def summarize(
     return Summary(reference, rows, against, between, notes)
 
 
+def completed(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """The records that count as complete: ended of themselves, and not short of what was seen on the plan."""
+    most: dict[str, float] = {}
+    for r in records:
+        most[r.plan_hash] = max(most.get(r.plan_hash, 0.0), r.coverage)
+    return [r for r in records if r.complete and r.coverage >= most[r.plan_hash] - SHORTFALL]
+
+
 class _Table:
     """Records by (policy, placement, pair), and the resampling that all figures share."""
 
     def __init__(
         self,
         records: dict[tuple[str, str, Pair], EpisodeRecord],
+        complete: set[Key],
         rng: np.random.Generator,
         resamples: int,
         confidence: float,
     ) -> None:
         self._records = records
+        self._complete = complete
         self._interval = functools.partial(bootstrap_interval, rng=rng, resamples=resamples, confidence=confidence)
 
     def completed(self, policy: str, placement: str) -> list[Pair]:
         return [
-            pair for (p, where, pair), r in self._records.items() if (p, where) == (policy, placement) and r.complete
+            pair
+            for (p, where, pair), r in self._records.items()
+            if (p, where) == (policy, placement) and r.key in self._complete
         ]
 
     def horizons(self, policies: list[str], common: dict[str, list[Pair]]) -> dict[str, float]:
@@ -188,7 +207,7 @@ class _Table:
             for policy in policies:
                 for pair in pairs:
                     record = self._records.get((policy, placement, pair))
-                    if record is not None and record.complete:
+                    if record is not None and record.key in self._complete:
                         longest[pair[0]] = max(longest.get(pair[0], 0.0), record.distance)
         return longest
 
@@ -212,14 +231,15 @@ class _Table:
             own = [r for (p, where, _), r in self._records.items() if (p, where) == (policy, placement)]
             if own:
                 ended = Counter(r.status for r in own)
-                counts = ended["complete"], ended["truncated"], ended["failed"]
+                complete = sum(r.key in self._complete for r in own)
+                counts = complete, ended["complete"] - complete, ended["truncated"], ended["failed"]
                 found.append(Row(policy, placement, len(own), *counts, metrics=metrics[policy]))
         return found
 
     def compare(
         self, sides: list[tuple[tuple[str, str], tuple[str, str]]], pairs: list[list[Pair]]
     ) -> list[Comparison]:
-        """Each (ours, theirs) over its pairs; the tests are corrected as one family."""
+        """Each (ours, theirs) over its pairs; the tests are corrected as one family. The best ratio first."""
         found = []
         for (ours, theirs), both in zip(sides, pairs, strict=True):
             a = np.array([self._records[(*ours, pair)].distance for pair in both])
@@ -242,7 +262,8 @@ class _Table:
                 )
             )
         corrected = holm([c.p for c in found])
-        return [dataclasses.replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
+        found = [dataclasses.replace(c, p_holm=float(p)) for c, p in zip(found, corrected, strict=True)]
+        return sorted(found, key=lambda c: (c.ours[1], c.ratio.estimate))
 
     def _metric(self, policy: str, placement: str, pairs: list[Pair], values: list[float | None]) -> Metric:
         clusters, strata = self._buildings(policy, placement, pairs)
@@ -278,19 +299,26 @@ def _sort_key(row: Row) -> tuple[bool, float]:
 def _notes(
     records: Sequence[EpisodeRecord], placement: str, policies: list[str], compared: list[str], common: int
 ) -> list[str]:
-    pairs = {(r.plan_hash, r.seed) for r in records if r.placement == placement}
+    here = [r for r in records if r.placement == placement]
+    pairs = {(r.plan_hash, r.seed) for r in here}
     notes = [
         f"{placement}: compared on {common} of {len(pairs)} starts, those completed by all {len(compared)} policies"
     ]
     left_out = [p for p in policies if p not in compared and any(r.policy == p for r in records)]
     if left_out:
         notes.append(f"{placement}: left out of the comparison, as nothing was completed: {', '.join(left_out)}")
-    errors = [r for r in records if r.placement == placement and r.status == "failed"]
+    errors = [r for r in here if r.status == "failed"]
     for r in errors[:3]:
         notes.append(f"{placement}: {r.policy} failed on {r.plan} (seed {r.seed}): {(r.error or '').splitlines()[0]}")
     if len(errors) > 3:
         notes.append(f"{placement}: {len(errors) - 3} more failed; see the field `error` of the records")
-    cut = sum(r.cut_nodes > 0 or r.cut_lines > 0 for r in records if r.placement == placement)
+    short = sum(r.complete for r in here) - sum(r.placement == placement for r in completed(records))
+    if short:
+        notes.append(
+            f"{placement}: {short} episodes ended having seen over {100 * SHORTFALL:.0f} % less of the plan than others "
+            "did on it: stopped short, not complete"
+        )
+    cut = sum(r.cut_nodes > 0 or r.cut_lines > 0 for r in here)
     if cut:
         notes.append(f"{placement}: in {cut} episodes the observation had no room for all nodes or lines at some time")
     return notes

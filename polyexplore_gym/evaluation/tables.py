@@ -12,26 +12,26 @@ from polyexplore_gym.errors import ResultsError
 from polyexplore_gym.evaluation.statistics import Interval
 from polyexplore_gym.evaluation.summary import METRICS, Comparison, Row, Summary
 
-_FIGURES = ("distance", "IQM", "90%", "95%", "99%", "AUC", "scans", "time", "bumps", "ms")
+_FIGURES = ("distance", "IQM", "seen%", "90%", "95%", "99%", "AUC", "scans", "time", "bumps", "ms")
 _HEADER = ("placement", "policy", "complete", *_FIGURES)
 _COMPARISON_HEADER = ("placement", "policy", "against", "pairs", "ratio", "P(shorter)", "p", "p Holm")
 LEGEND = """\
-distance: mean driven until the map was complete, m, with its 95 % interval; IQM: its interquartile mean; 90%, 95%,
-99%: mean driven until so much was seen, m; AUC: mean coverage over the longest distance compared on the plan; scans,
-time (s), bumps: means an episode; ms: mean decision. ratio: geometric mean of the distances' ratios, below 1 is
-shorter; P(shorter): probability of the shorter way on the same plan and start; p: Wilcoxon signed-rank test. A figure
-in brackets after a mean: it stands on so many starts only."""
+distance: mean driven until no reachable jump edge was left, m, with its 95 % interval; IQM: its interquartile mean;
+seen%: mean share of the free area seen by then; 90%, 95%, 99%: mean driven until so much was seen, m; AUC: mean
+coverage over the longest distance compared on the plan; scans, time (s), bumps: means an episode; ms: mean decision.
+ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): probability of the shorter way on the
+same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: the mean stands on so many starts only."""
 
 
 def summary_text(summary: Summary, style: str = "text") -> str:
     """All tables of a summary, `style` "text" (aligned columns) or "markdown"."""
     parts = [format_table(_HEADER, [_row(row) for row in summary.rows], style)]
     if summary.against_reference:
-        lines = [_comparison(c, c.ours[1], c.ours[0], c.theirs[0]) for c in summary.against_reference]
-        parts.append(format_table(_COMPARISON_HEADER, lines, style))
+        lines = [_comparison(c, c.theirs[0]) for c in summary.against_reference]
+        parts += ["Policies, at the same placement:", format_table(_COMPARISON_HEADER, lines, style)]
     if summary.between_placements:
-        lines = [_comparison(c, c.ours[1], c.ours[0], c.theirs[1]) for c in summary.between_placements]
-        parts.append(format_table(_COMPARISON_HEADER, lines, style))
+        lines = [_comparison(c, c.theirs[1]) for c in summary.between_placements]
+        parts += ["Placements, with the same policy:", format_table(_COMPARISON_HEADER, lines, style)]
     bullet = "- " if style == "markdown" else ""
     parts.append("\n".join(bullet + note for note in summary.notes))
     parts.append(LEGEND)
@@ -57,14 +57,15 @@ def write_tables(summary: Summary, folder: Path) -> list[Path]:
 def summary_csv(summary: Summary) -> str:
     """Every figure of every row, with its interval, one row a policy and placement."""
     names = [*METRICS, "auc"]
-    header = ["policy", "placement", "episodes", "complete", "truncated", "failed"]
+    header = ["policy", "placement", "episodes", "complete", "short", "truncated", "failed"]
     for name in names:
         header += [
             f"{name}_{part}" for part in ("pairs", "mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high")
         ]
     lines: list[list[object]] = []
     for row in summary.rows:
-        line: list[object] = [row.policy, row.placement, row.episodes, row.complete, row.truncated, row.failed]
+        line: list[object] = [row.policy, row.placement, row.episodes, row.complete]
+        line += [row.short, row.truncated, row.failed]
         for name in names:
             metric = row.metrics.get(name)
             line += [metric.pairs, *_cells(metric.mean), *_cells(metric.iqm)] if metric else [0] + [""] * 6
@@ -124,6 +125,7 @@ def _row(row: Row) -> list[str]:
         _counts(row),
         _interval(distance.mean, 1) if distance and compared else "-",
         _number(distance.iqm.estimate, 1) if distance and compared else "-",
+        mean("coverage", 1, 100.0),
         mean("distance_90", 1),
         mean("distance_95", 1),
         mean("distance_99", 1),
@@ -137,14 +139,16 @@ def _row(row: Row) -> list[str]:
 
 def _counts(row: Row) -> str:
     text = f"{row.complete}/{row.episodes}"
-    extra = [f"{n} {word}" for n, word in ((row.truncated, "cut off"), (row.failed, "failed")) if n]
+    extra = [
+        f"{n} {word}" for n, word in ((row.short, "short"), (row.truncated, "cut off"), (row.failed, "failed")) if n
+    ]
     return f"{text} ({', '.join(extra)})" if extra else text
 
 
-def _comparison(c: Comparison, placement: str, policy: str, against: str) -> list[str]:
+def _comparison(c: Comparison, against: str) -> list[str]:
     return [
-        placement,
-        policy,
+        c.ours[1],
+        c.ours[0],
         against,
         str(c.pairs),
         _interval(c.ratio, 3) if c.pairs else "-",

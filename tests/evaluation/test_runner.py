@@ -102,7 +102,7 @@ def test_an_action_that_is_none_fails_the_episode_only():
         def act(self, observation, info, rng):
             return None
 
-    record = run_episode(FakeEnv(EnvConfig()), Mute(), plan(0), 0, label="mute", placement="midpoint", drive="physics")
+    record = run_episode(FakeEnv(EnvConfig()), Mute(), plan(0), 0, label="mute")
     assert record.status == "failed"
     assert "None" in record.error
     assert record.curve_distance == (0.0,)

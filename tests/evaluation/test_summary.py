@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import io
 
 import numpy as np
@@ -16,6 +17,7 @@ from polyexplore_gym.evaluation import (
     write_tables,
 )
 from polyexplore_gym.evaluation.plots import coverage_figure, ratio_figure, save
+from polyexplore_gym.evaluation.summary import completed
 from polyexplore_gym.evaluation.tables import format_table
 
 
@@ -211,3 +213,19 @@ def test_figures_show_all_policies(records, tmp_path):
         assert picture.std() > 0.01
     with pytest.raises(ResultsError, match="cannot be written"):
         save(figure, tmp_path / "nowhere" / "x.png")
+
+
+def test_giving_up_early_does_not_win():
+    records = [record("nearest", i, 10.0) for i in range(4)] + [record("b", i, 20.0) for i in range(4)]
+    early = dataclasses.replace(record("b", 1, 1.0), coverage=0.97)
+    nearly = dataclasses.replace(record("b", 2, 20.0), coverage=0.985)
+    records[5], records[6] = early, nearly
+    assert completed(records) == [r for r in records if r is not early]
+    summary = figures(records)
+    rows = {row.policy: row for row in summary.rows}
+    assert (rows["b"].complete, rows["b"].short, rows["nearest"].short) == (3, 1, 0)
+    assert rows["b"].metrics["distance"].mean.estimate == 20.0
+    assert rows["b"].metrics["coverage"].mean.estimate == pytest.approx((2 + 0.985) / 3)
+    assert summary.against_reference[0].ratio.estimate == pytest.approx(2.0)
+    assert "1 episodes ended having seen over 2 % less" in "\n".join(summary.notes)
+    assert "3/4 (1 short)" in summary_text(summary)

@@ -1,0 +1,365 @@
+"""The command line `polyexplore`. Thin: it finds plans, calls the library and prints.
+
+The library is imported by the command that needs it, so that `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+
+if TYPE_CHECKING:
+    from polyexplore_gym.evaluation import EpisodeRecord, Study, Summary
+    from polyexplore_gym.floorplan import FloorPlan
+    from polyexplore_gym.snapshot import Snapshot
+
+BENCH_PLANS = {"home-test": 12, "angled-test": 4, "office-test": 2}
+"""What `polyexplore bench` runs on unless told otherwise: so many of the first plans of these suites.
+
+All scripted policies and both placements then take about three minutes on two cores.
+"""
+SCRIPTED = ("nearest", "largest", "ekman_ratio", "modified_sum", "utility", "distance_advantage", "random")
+
+PLAN_SUFFIXES = (".json", ".geojson", ".yaml", ".yml")
+"""What is taken for a plan in a folder."""
+
+Placement = Literal["midpoint", "in_front"]
+Drive = Literal["physics", "kinematic"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """Compare policies on the same plans, starts and noise; prints tables, keeps results and plots.
+
+    A run that was stopped goes on where it was when it is started again with the same arguments.
+    """
+
+    suite: tuple[str, ...] = ()
+    """Suites of generated plans, such as home-test or office-validation (default: a mix that takes minutes)."""
+    plans: tuple[Path, ...] = ()
+    """Plan files, or folders of them, instead of suites."""
+    first: int | None = None
+    """Only the first so many plans, of each suite."""
+    policies: tuple[str, ...] = SCRIPTED
+    """Names of baselines, with parameters as in utility:rate=0.1, or module:attribute for an own policy."""
+    placements: tuple[Placement, ...] = ("midpoint", "in_front")
+    """Where nodes are placed."""
+    seeds: int = 1
+    """Starts (and streams of noise) on each plan."""
+    workers: int = 0
+    """Processes; 0: one a core."""
+    out: Path = Path("results/bench")
+    """Folder of the results."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
+    reference: str = "nearest"
+    """Policy that the others are compared with."""
+    plots: bool = True
+    """Draw the plots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
+    """Explore one plan with one policy; prints a summary, and films it if asked to."""
+
+    plan: tyro.conf.Positional[str]
+    """A plan file, or a plan of a suite: home-test/3."""
+    policy: str = "nearest"
+    """Name of a baseline, or module:attribute for an own policy."""
+    seed: int = 0
+    """Seed of the start and the noise."""
+    start: tuple[float, float, float] | None = None
+    """Start: x and y in m, heading in degrees; drawn from the seed if left out."""
+    placement: Placement | None = None
+    """Where nodes are placed, instead of what the configuration says."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    gif: Path | None = None
+    """Film the exploration to this .gif file."""
+    mp4: Path | None = None
+    """Film the exploration to this .mp4 file."""
+    png: Path | None = None
+    """Draw the end of it to this .png, .pdf or .svg file."""
+    width: int = 800
+    """Width of the pictures, pixels."""
+    step: float = 0.5
+    """Film: a frame every so many metres as well; 0: decisions only."""
+    fps: float = 10.0
+    """Film: frames a second."""
+
+
+def bench(options: Bench) -> int:
+    """Run, or go on with, a comparison."""
+    import numpy as np
+
+    from polyexplore_gym.evaluation import Study, evaluate, name_policies, summarize, summary_text, write_tables
+
+    if options.seeds < 1:
+        raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
+    config = _config(options.config, options.drive)
+    study = Study(
+        policies=name_policies(options.policies),
+        plans=list(_bench_plans(options, config)),
+        placements=options.placements,
+        seeds=range(options.seeds),
+        config=config,
+    )
+    total = len(study.policies) * len(study.placements) * len(study.plans) * len(study.seeds)
+    _say(f"{len(study.plans)} plans x {len(study.seeds)} starts x {len(study.placements)} placements x "
+         f"{len(study.policies)} policies = {total} episodes -> {options.out}")  # fmt: skip
+    try:
+        records = evaluate(study, out=options.out, workers=options.workers or os.cpu_count() or 1)
+    except KeyboardInterrupt:
+        _say(f"\nstopped; the results so far are in {options.out}: the same command goes on from there")
+        return 130
+    summary = summarize(records, np.random.default_rng(0), reference=options.reference)
+    written = write_tables(summary, options.out)
+    print(summary_text(summary))
+    if options.plots:
+        try:
+            written += _bench_plots(study, records, summary, options)
+        except MissingDependencyError as error:
+            _say(f"no plots: {error}")
+    _say(f"written to {options.out}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+def run(options: Run) -> int:
+    """Explore one plan."""
+    import math
+
+    from tqdm import tqdm
+
+    from polyexplore_gym.evaluation import load_policy, run_episode
+    from polyexplore_gym.evaluation.runner import make_env
+
+    _check_outputs(options)
+    config = _config(options.config, options.drive, options.placement)
+    plan = _plan(options.plan)
+    policy = load_policy(options.policy)
+    env = make_env(config)
+    start = {}
+    if options.start is not None:
+        start["start"] = (*options.start[:2], math.radians(options.start[2]))
+        plan.check_start(start["start"], config.robot.radius)
+    plan.check_connected(config.robot.radius)
+    films = [path for path in (options.gif, options.mp4) if path is not None]
+    moments: list[tuple[int | None, Snapshot]] = []
+
+    with tqdm(total=100.0, bar_format="{desc} |{bar}| {n:.1f} % seen [{elapsed}]", desc=plan.name) as bar:
+
+        def watch(env: Any, info: Any, action: int | None, over: bool) -> None:
+            text = f"{plan.name} {info['distance']:.1f} m, {info['measurements']} scans"
+            bar.set_description_str(text, refresh=False)
+            bar.update(100.0 * info["coverage"] - bar.n)
+            if films or (options.png and over):
+                moments.append((action, env.unwrapped.snapshot()))
+
+        record = run_episode(env, policy, plan, options.seed, label=options.policy, options=start, observer=watch)
+    print(_run_text(record, plan))
+    if moments:
+        _film(moments, films, options)
+    env.close()
+    return 0 if record.status != "failed" else 1
+
+
+_COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {"bench": (Bench, bench), "run": (Run, run)}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code: 0, 1 (the episode failed), 2 (bad input) or 130 (Ctrl-C)."""
+    kinds: dict[str, Callable[..., Any]] = {name: kind for name, (kind, _) in _COMMANDS.items()}
+    options: Any = tyro.extras.subcommand_cli_from_dict(
+        kinds, prog="polyexplore", description="Exploration of unknown polygonal floor plans.", args=arguments
+    )
+    call = next(call for kind, call in _COMMANDS.values() if isinstance(options, kind))
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+        try:
+            return call(options)
+        except PolyExploreError as error:
+            _say(f"error: {error}")
+            return 2
+        except KeyboardInterrupt:
+            _say("\nstopped")
+            return 130
+
+
+def _config(path: Path | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+    config = EnvConfig()
+    if path is not None:
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InvalidConfigError(f"{path}: cannot be read: {error}") from error
+        config = from_mapping(EnvConfig, values, path=str(path))
+    if drive is not None:
+        config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
+    if placement is not None:
+        config = replace(config, exploration=replace(config.exploration, placement=placement))  # type: ignore[arg-type]
+    return config
+
+
+def _plan(name: str) -> FloorPlan:
+    """A plan by path, or by suite and number; what exists as a file is a path."""
+    from polyexplore_gym.floorplan import load_plan
+
+    suite_name, slash, number = name.rpartition("/")
+    if slash and number.isdigit() and not Path(name).exists():
+        suite = _suite(suite_name)
+        if int(number) >= len(suite):
+            raise InvalidFloorPlanError(f"{name}: {suite_name} has the plans 0 to {len(suite) - 1}")
+        return suite.plan(int(number))
+    return load_plan(name)
+
+
+def _suite(name: str) -> Any:
+    from polyexplore_gym.floorplan import suite
+
+    try:
+        return suite(name)
+    except ValueError as error:
+        raise InvalidConfigError(str(error)) from error
+
+
+def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
+    """The plans to run on. A bad file is named and left out; raises when no plan is left."""
+    if options.suite and options.plans:
+        raise InvalidConfigError("give either --suite or --plans")
+    first = options.first
+    if first is not None and first < 1:
+        raise InvalidConfigError(f"--first {first}: must be at least 1")
+    if not options.plans:
+        for name in options.suite or BENCH_PLANS:
+            suite = _suite(name)
+            some = first if options.suite else min(first or len(suite), BENCH_PLANS[name])
+            yield from (suite.plan(i) for i in range(len(suite))[:some])
+        return
+    from polyexplore_gym.floorplan import load_plan
+
+    known: dict[str, Path] = {}
+    for path in _plan_files(options.plans):
+        if len(known) == first:
+            break
+        try:
+            plan = load_plan(path)
+            plan.check_connected(config.robot.radius)
+        except InvalidFloorPlanError as error:
+            text = str(error)
+            _say(f"left out: {text if str(path) in text else f'{path}: {text}'}")
+            continue
+        if plan.content_hash in known:
+            _say(f"left out: {path}: the same geometry as {known[plan.content_hash]}")
+            continue
+        known[plan.content_hash] = path
+        yield plan
+    if not known:
+        raise InvalidFloorPlanError("no usable floor plan in " + ", ".join(map(str, options.plans)))
+
+
+def _plan_files(paths: Iterable[Path]) -> Iterator[Path]:
+    for path in paths:
+        if path.is_dir():
+            yield from sorted(p for p in path.iterdir() if p.suffix.lower() in PLAN_SUFFIXES and p.is_file())
+        else:
+            yield path
+
+
+def _bench_plots(study: Study, records: list[EpisodeRecord], summary: Summary, options: Bench) -> list[Path]:
+    import numpy as np
+
+    from polyexplore_gym.evaluation import plots
+
+    figure = plots.coverage_figure(records, np.random.default_rng(0), reference=options.reference)
+    written = [plots.save(figure, options.out / "coverage.png")]
+    written.append(plots.save(plots.ratio_figure(summary), options.out / "ratios.png"))
+    # One plan of middle size, seen with every policy.
+    plan = sorted(study.plans, key=lambda p: p.area)[len(study.plans) // 2]
+    seed = study.seeds[0]
+    for placement in study.placements:
+        ran = {r.policy for r in records if (r.plan_hash, r.seed) == (plan.content_hash, seed) and r.status != "failed"}
+        policies = {label: spec for label, spec in study.policies.items() if label in ran}
+        if policies:
+            figure = plots.trajectory_figure(policies, plan, seed, study.config_for(placement))
+            written.append(plots.save(figure, options.out / f"trajectories-{placement}.png"))
+    return written
+
+
+def _check_outputs(options: Run) -> None:
+    """Reject a file that could not be written before the exploration, not after it."""
+    for path, suffixes in ((options.gif, (".gif",)), (options.mp4, (".mp4",)), (options.png, (".png", ".pdf", ".svg"))):
+        if path is None:
+            continue
+        if path.suffix.lower() not in suffixes:
+            raise InvalidConfigError(f"{path}: the name must end in {' or '.join(suffixes)}")
+        if not path.parent.is_dir():
+            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+    if options.step < 0 or 0 < options.step < 0.02:
+        raise InvalidConfigError(f"--step {options.step}: must be 0 or at least 0.02")
+    if not 0.1 <= options.fps <= 100:
+        raise InvalidConfigError(f"--fps {options.fps}: must lie in 0.1 to 100")
+    if any((options.gif, options.mp4, options.png)):
+        from polyexplore_gym.animation import require
+
+        for module in ("matplotlib", *(["PIL"] if options.gif else []), *(["imageio_ffmpeg"] if options.mp4 else [])):
+            require(module, "plots")
+
+
+def _film(moments: list[tuple[int | None, Snapshot]], films: list[Path], options: Run) -> None:
+    """Draw the snapshots, each with the action that led to it."""
+    from tqdm import tqdm
+
+    from polyexplore_gym import rendering
+    from polyexplore_gym.animation import motion, save_animation
+
+    last = moments[-1][1]
+    scenes: list[Snapshot] = []
+    for (_, before), (action, after) in itertools.pairwise(moments) if films else ():
+        scenes += motion(before, after, action, options.step or max(after.distance, 1.0))
+    for path in films:
+        bar = tqdm([*scenes, last], desc=path.name, unit="frame")
+        save_animation((rendering.frame(s, options.width) for s in bar), path, fps=options.fps)
+        print(f"written: {path}")
+    if options.png:
+        rendering.save_figure(last, options.png, width=options.width)
+        print(f"written: {options.png}")
+
+
+def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
+    reached = [
+        f"{percent} % after " + (f"{d:.1f} m" if d is not None else "- (never)")
+        for percent, d in ((90, record.distance_90), (95, record.distance_95), (99, record.distance_99))
+    ]
+    status = record.status if record.error is None else f"failed: {record.error}"
+    return (
+        f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
+        f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"
+        f"  seen          {100 * record.coverage:.1f} % ({', '.join(reached)})\n"
+        f"  measurements  {record.measurements}\n"
+        f"  collisions    {record.collisions}"
+    )
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
