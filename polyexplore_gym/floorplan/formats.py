@@ -15,12 +15,13 @@ from typing import Any
 
 from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.floorplan.model import FloorPlan
+from polyexplore_gym.floorplan.validation import shorten
 
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Largest JSON file read."""
 _IMAGES = {".pgm", ".png", ".pnm", ".pbm", ".ppm", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff"}
-_GEOJSON_TYPES = {"Feature", "FeatureCollection", "GeometryCollection", "Polygon", "MultiPolygon"}
-_GEOJSON_OTHERS = {"Point", "MultiPoint", "LineString", "MultiLineString"}
+_GEOJSON_TYPES = ("Feature", "FeatureCollection", "GeometryCollection", "Polygon", "MultiPolygon")
+_GEOJSON_OTHERS = ("Point", "MultiPoint", "LineString", "MultiLineString")
 
 
 def load_plan(
@@ -72,7 +73,7 @@ def from_mapping(data: Any, name: str = "plan") -> FloorPlan:
     if "verts" in data:
         meta = {k: data[k] for k in ("room_num", "room_category") if k in data}
         return FloorPlan.create(data["verts"], name=_name(data.get("id"), name), meta={**meta, "format": "HouseExpo"})
-    if data.get("type") in _GEOJSON_TYPES | _GEOJSON_OTHERS:
+    if data.get("type") in _GEOJSON_TYPES + _GEOJSON_OTHERS:
         return _from_geojson(data, name)
     raise InvalidFloorPlanError(
         "not a floor plan: expected the key 'exterior' (plan), 'verts' (HouseExpo) or a GeoJSON 'type'"
@@ -133,7 +134,7 @@ def _name(value: Any, default: str) -> str:
 
 def _from_plan_json(data: Mapping[str, Any], name: str) -> FloorPlan:
     if data.get("units", "m") != "m":
-        raise InvalidFloorPlanError(f"units {data['units']!r}: only 'm' is known")
+        raise InvalidFloorPlanError(f"units {shorten(data['units'])}: only 'm' is known")
     meta = data.get("meta", {})
     if not isinstance(meta, Mapping):
         raise InvalidFloorPlanError(f"meta: expected an object, got {type(meta).__name__}")
@@ -150,7 +151,7 @@ def _from_geojson(data: Mapping[str, Any], name: str) -> FloorPlan:
     if not isinstance(coordinates, list) or not coordinates:
         raise InvalidFloorPlanError("GeoJSON: a Polygon's 'coordinates' must be a list of rings, the exterior first")
     if properties.get("units", "m") != "m":
-        raise InvalidFloorPlanError(f"units {properties['units']!r}: only 'm' is known")
+        raise InvalidFloorPlanError(f"units {shorten(properties['units'])}: only 'm' is known")
     meta = properties.get("meta", {k: v for k, v in properties.items() if k not in ("name", "units")})
     exterior, *holes = (_without_altitude(ring) for ring in coordinates)
     if not isinstance(meta, Mapping):
@@ -182,7 +183,7 @@ def _geojson_polygons(data: Any, properties: Mapping[str, Any]) -> list[tuple[An
         return [polygon for member in members for polygon in _geojson_polygons(member, properties)]
     if kind in _GEOJSON_OTHERS:
         return []
-    raise InvalidFloorPlanError(f"GeoJSON: unknown type {kind!r}")
+    raise InvalidFloorPlanError(f"GeoJSON: unknown type {shorten(kind)}")
 
 
 def _without_altitude(ring: Any) -> Any:

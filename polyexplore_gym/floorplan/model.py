@@ -16,7 +16,7 @@ import shapely
 import shapely.ops
 
 from polyexplore_gym.errors import InvalidFloorPlanError
-from polyexplore_gym.floorplan.validation import normalise, signed_area
+from polyexplore_gym.floorplan.validation import normalise, shorten, signed_area
 
 POCKET_AREA = 1.0
 """Largest pocket that the robot need not reach, m2; it must also be below `POCKET_SHARE`."""
@@ -216,7 +216,9 @@ class FloorPlan:
         except (TypeError, ValueError):
             values = np.empty(0)
         if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
-            raise InvalidFloorPlanError(f"{self.name}: start {pose!r}: expected finite numbers x, y and a heading")
+            raise InvalidFloorPlanError(
+                f"{self.name}: start {shorten(pose)}: expected finite numbers x, y and a heading"
+            )
         where = f"{self.name}: start ({values[0]:g}, {values[1]:g})"
         clearance = float(self.clearance(values[:2])[0])
         if clearance < 0:

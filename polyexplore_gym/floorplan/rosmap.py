@@ -18,6 +18,7 @@ import shapely
 
 from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.floorplan.model import FloorPlan
+from polyexplore_gym.floorplan.validation import shorten
 
 MAX_PIXELS = 100_000_000
 """Largest image read."""
@@ -190,9 +191,9 @@ def _pixel_of(
     try:
         x, y = float(start[0]), float(start[1])
     except (TypeError, ValueError, IndexError) as error:
-        raise InvalidFloorPlanError(f"start {start!r}: expected numbers x, y") from error
+        raise InvalidFloorPlanError(f"start {shorten(start)}: expected numbers x, y") from error
     if not (math.isfinite(x) and math.isfinite(y)):
-        raise InvalidFloorPlanError(f"start {start!r}: must be finite")
+        raise InvalidFloorPlanError(f"start {shorten(start)}: must be finite")
     cos, sin = math.cos(origin[2]), math.sin(origin[2])
     dx, dy = x - origin[0], y - origin[1]
     column = math.floor((cos * dx + sin * dy) / resolution)
@@ -216,9 +217,9 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         if key not in data:
             raise InvalidFloorPlanError(f"{key}: the field is missing")
     if not isinstance(data["image"], str) or not data["image"]:
-        raise InvalidFloorPlanError(f"image {data['image']!r}: expected a file name")
+        raise InvalidFloorPlanError(f"image {shorten(data['image'])}: expected a file name")
     if data.get("mode", "trinary") not in ("trinary", "scale"):
-        raise InvalidFloorPlanError(f"mode {data['mode']!r}: only trinary and scale are known")
+        raise InvalidFloorPlanError(f"mode {shorten(data['mode'])}: only trinary and scale are known")
     values = {**_DEFAULTS, **data}
     fields: dict[str, Any] = {"image": data["image"]}
     for key in ("resolution", "negate", "occupied_thresh", "free_thresh"):
@@ -226,7 +227,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if not 0 < fields["resolution"] <= 10:
         raise InvalidFloorPlanError(f"resolution {fields['resolution']!r}: must lie in (0, 10] m")
     if fields["negate"] not in (0, 1):
-        raise InvalidFloorPlanError(f"negate {values['negate']!r}: must be 0 or 1")
+        raise InvalidFloorPlanError(f"negate {shorten(values['negate'])}: must be 0 or 1")
     for key in ("occupied_thresh", "free_thresh"):
         if not 0 <= fields[key] <= 1:
             raise InvalidFloorPlanError(f"{key} {fields[key]!r}: must lie in 0 to 1")
@@ -236,7 +237,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         )
     origin = data["origin"]
     if not isinstance(origin, list) or len(origin) not in (2, 3):
-        raise InvalidFloorPlanError(f"origin {origin!r}: expected [x, y, yaw]")
+        raise InvalidFloorPlanError(f"origin {shorten(origin)}: expected [x, y, yaw]")
     fields["origin"] = (*(_number(v, "origin") for v in origin), 0.0)[:3]
     return fields
 
@@ -248,7 +249,7 @@ def _number(value: Any, key: str) -> float:
     except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise InvalidFloorPlanError(f"{key} {value!r}: expected a finite number")
+        raise InvalidFloorPlanError(f"{key} {shorten(value)}: expected a finite number")
     return number
 
 

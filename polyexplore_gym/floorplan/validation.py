@@ -8,6 +8,7 @@ and the ring's direction.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -26,6 +27,8 @@ MIN_AREA = 1e-6
 """Smallest area of a ring, m2."""
 # Edges per query of the crossing search: bounds the memory when every edge crosses every other.
 _BLOCK = 64
+_REPR = reprlib.Repr()
+_REPR.maxlevel = 2
 
 
 def fail(ring: str, vertex: int | None, reason: str) -> NoReturn:
@@ -71,6 +74,12 @@ def normalise(exterior: Any, holes: Any) -> tuple[np.ndarray, tuple[np.ndarray, 
     return rings[0], tuple(rings[1:])
 
 
+def shorten(value: Any) -> str:
+    """A value as text for a message, short and quick to make whatever its size and nesting."""
+    text = _REPR.repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
 def signed_area(ring: np.ndarray) -> float:
     """Area of a ring (n, 2), m2; positive when counter-clockwise."""
     p = ring - ring[0]
@@ -105,19 +114,14 @@ def _to_array(points: Any, name: str) -> np.ndarray:
 
 def _to_point(point: Any, name: str, i: int) -> tuple[float, float]:
     if isinstance(point, (str, bytes)) or not isinstance(point, (Sequence, np.ndarray)) or len(point) != 2:
-        fail(name, i, f"expected two numbers x, y, got {_shorten(point)}")
+        fail(name, i, f"expected two numbers x, y, got {shorten(point)}")
     for value in point:
         if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-            fail(name, i, f"expected a number, got {_shorten(value)}")
+            fail(name, i, f"expected a number, got {shorten(value)}")
     try:
         return float(point[0]), float(point[1])
     except OverflowError:
         fail(name, i, f"the coordinate lies beyond {MAX_COORDINATE / 1000:g} km; units are metres")
-
-
-def _shorten(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."
 
 
 def _without_repeats(ring: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -206,6 +206,16 @@ def test_bad_yaml(tmp_path, text):
         load_plan(tmp_path / "map.yaml")
 
 
+def test_yaml_bomb(tmp_path):
+    """Aliases that unfold to 10^9 items end in a short message."""
+    lines = ["a0: &a0 [0, 0]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 10)]
+    (tmp_path / "map.yaml").write_text("\n".join([*lines, "image: a.pgm", "resolution: 0.05", "origin: *a9"]))
+    with pytest.raises(InvalidFloorPlanError, match=r"origin .* expected") as caught:
+        load_plan(tmp_path / "map.yaml")
+    assert len(str(caught.value)) < 2000
+
+
 @pytest.mark.parametrize("suffix", [".pgm", ".png"])
 def test_truncated_or_damaged_image(tmp_path, suffix):
     path = write_map(tmp_path, room(), suffix)
