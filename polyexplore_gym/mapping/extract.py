@@ -95,6 +95,8 @@ def extract_lines(
         label, count = hough_labels(x, y, *noise, *limits, config.door_width)
     else:
         label, count = endpoint_labels(x, y, beam_of, resolution, *noise, *limits)
+    if sensor.full_circle and count > 0:
+        start = _reseam(x, y, beam_of, reach_of, cos_t, sin_t, label, start)
     return ScanLines(
         *_assemble(
             x, y, beam_of, reach_of, cos_t, sin_t, start, sensor.max_range, resolution, label, count,
@@ -132,17 +134,17 @@ def _returns(
 ) -> tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """First beam of a turned scan, and x, y, beam of its returns, and ranges, cos, sin of its beams.
 
-    A full circle is turned so that it starts at its widest discontinuity: no wall then runs over
-    the seam, where possible.
+    A full circle is turned to start behind a missing return, else at the farthest one: that is the
+    end of a wall, so no wall runs over the seam but for a beam or two (see `_reseam`).
     """
     n = angles.size
     start = 0
     if full_circle:
-        widest = -1.0
+        far = -1.0
         for k in range(n):
-            a, b = min(ranges[k - 1], 2.0 * max_range), min(ranges[k], 2.0 * max_range)
-            if abs(a - b) / min(a, b) > widest:
-                start, widest = k, abs(a - b) / min(a, b)
+            d = math.inf if ranges[k - 1] >= max_range and ranges[k] < max_range else ranges[k]
+            if d > far and ranges[k] < max_range:
+                start, far = k, d
     turned, cos_t, sin_t = np.empty(n), np.empty(n), np.empty(n)
     x, y, beam = np.empty(n), np.empty(n), np.empty(n, np.int64)
     m = 0
@@ -155,6 +157,31 @@ def _returns(
             x[m], y[m], beam[m] = d * c, d * s, q
             m += 1
     return start, (x[:m].copy(), y[:m].copy(), beam[:m].copy(), turned, cos_t, sin_t)
+
+
+@njit(cache=True)
+def _reseam(
+    x: np.ndarray,
+    y: np.ndarray,
+    beam: np.ndarray,
+    ranges: np.ndarray,
+    cos_t: np.ndarray,
+    sin_t: np.ndarray,
+    label: np.ndarray,
+    start: int,
+) -> int:
+    """Turn a full circle again, in place, to start between two labels; returns the new first beam."""
+    n, m = ranges.size, x.size
+    best, widest = 0, -1.0
+    for k in range(1, m):
+        gap = (x[k] - x[k - 1]) ** 2 + (y[k] - y[k - 1]) ** 2
+        if label[k] != label[k - 1] and gap > widest:
+            best, widest = k, gap
+    by = beam[best]
+    x[:], y[:], label[:] = np.roll(x, -best), np.roll(y, -best), np.roll(label, -best)
+    beam[:] = (np.roll(beam, -best) - by) % n
+    ranges[:], cos_t[:], sin_t[:] = np.roll(ranges, -by), np.roll(cos_t, -by), np.roll(sin_t, -by)
+    return (start + by) % n
 
 
 @njit(cache=True)
