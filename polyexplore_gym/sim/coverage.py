@@ -69,10 +69,10 @@ def _visible(segments, x, y, dx, dy, reach):  # type: ignore[no-untyped-def]
         low, high = _bin(ay, ax), _bin(by, bx)
         i, j = starts[low], starts[high + 1]
         if low <= high:
-            strike(sx[i:j], sy[i:j], nearest[i:j], ax, ay, bx, by)
+            strike(sx, sy, nearest, i, j, ax, ay, bx, by)
         else:  # across the seam
-            strike(sx[i:], sy[i:], nearest[i:], ax, ay, bx, by)
-            strike(sx[:j], sy[:j], nearest[:j], ax, ay, bx, by)
+            strike(sx, sy, nearest, i, n, ax, ay, bx, by)
+            strike(sx, sy, nearest, 0, j, ax, ay, bx, by)
     out = np.empty(n, np.bool_)
     for i in range(n):
         out[i] = nearest[place[i]] <= 1.0 + _DEPTH_TOLERANCE

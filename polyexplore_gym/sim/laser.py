@@ -53,12 +53,13 @@ def out_of_reach(ax, ay, bx, by, reach):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def strike(dir_x, dir_y, best, ax, ay, bx, by):  # type: ignore[no-untyped-def]
-    """Raise `best` (n,) to 1/t where the ray t (dir_x, dir_y) from the origin meets the wall a, b; needs a x b > 0."""
+def strike(dir_x, dir_y, best, low, high, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+    """Raise best[low:high] to 1/t where the ray t (dir_x, dir_y) from the origin meets wall a, b; needs a x b > 0."""
     ex, ey = bx - ax, by - ay
     inverse = 1.0 / (ax * by - ay * bx)
     mx, my = ex * inverse, ey * inverse
-    for i in range(best.size):
+    # unsigned, so that no index is tested for counting from the end; bounds instead of slices, which cost more
+    for i in range(np.uint64(low), np.uint64(high)):
         dx, dy = dir_x[i], dir_y[i]
         value = dx * my - dy * mx
         inside = (ax * dy - ay * dx >= -END_TOLERANCE) & (dx * by - dy * bx >= -END_TOLERANCE)
@@ -66,7 +67,7 @@ def strike(dir_x, dir_y, best, ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def strike_edge_on(dir_x, dir_y, best, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+def strike_edge_on(dir_x, dir_y, best, low, high, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """The same for a wall on a line through the origin, or of no length: only its nearer end can be hit.
 
     Directions must have unit length. Returns True if the origin lies on the wall itself.
@@ -78,7 +79,7 @@ def strike_edge_on(dir_x, dir_y, best, ax, ay, bx, by):  # type: ignore[no-untyp
     distance = math.hypot(ax, ay)
     if distance <= ON_LINE:
         return True
-    for i in range(best.size):
+    for i in range(low, high):
         if abs(ax * dir_y[i] - ay * dir_x[i]) <= ON_LINE and ax * dir_x[i] + ay * dir_y[i] > 0.0:
             best[i] = max(best[i], 1.0 / distance)
     return False
@@ -94,6 +95,7 @@ def _cast(segments, x, y, dir_x, dir_y, first, step, slack, max_range):  # type:
     best = np.zeros(n)
     blind = step <= 0.0 or slack >= math.pi
     slack += _BEARING_ERROR
+    first = (first + math.pi) % _TWO_PI - math.pi
     inverse_step = 1.0 / step if step > 0.0 else 0.0
     for k in range(segments.shape[0]):
         ax, ay = segments[k, 0] - x, segments[k, 1] - y
@@ -111,13 +113,15 @@ def _cast(segments, x, y, dir_x, dir_y, first, step, slack, max_range):  # type:
         low, high = 0, n - 1
         if blind:
             if edge_on:
-                if strike_edge_on(dir_x, dir_y, best, ax, ay, bx, by):
+                if strike_edge_on(dir_x, dir_y, best, 0, n, ax, ay, bx, by):
                     return np.zeros(n)
             else:
-                strike(dir_x, dir_y, best, ax, ay, bx, by)
+                strike(dir_x, dir_y, best, 0, n, ax, ay, bx, by)
             continue
-        start = (_bearing(ay, ax) - first) % _TWO_PI
-        width = (_bearing(by, bx) - first) % _TWO_PI - start
+        start = _bearing(ay, ax) - first
+        start += _TWO_PI if start < 0.0 else 0.0
+        width = _bearing(by, bx) - first
+        width += (_TWO_PI if width < 0.0 else 0.0) - start
         if edge_on:
             if ax * bx + ay * by <= 0.0:
                 return np.zeros(n)
@@ -133,10 +137,10 @@ def _cast(segments, x, y, dir_x, dir_y, first, step, slack, max_range):  # type:
             if high < low:
                 continue
             if edge_on:
-                if strike_edge_on(dir_x[low : high + 1], dir_y[low : high + 1], best[low : high + 1], ax, ay, bx, by):
+                if strike_edge_on(dir_x, dir_y, best, low, high + 1, ax, ay, bx, by):
                     return np.zeros(n)
             else:
-                strike(dir_x[low : high + 1], dir_y[low : high + 1], best[low : high + 1], ax, ay, bx, by)
+                strike(dir_x, dir_y, best, low, high + 1, ax, ay, bx, by)
     for i in range(n):
         distance = 1.0 / best[i] if best[i] > 0.0 else np.inf
         best[i] = distance if distance <= max_range else np.inf
