@@ -82,7 +82,7 @@ def single(walls: np.ndarray, centroid: bool, sensor: SensorConfig, scans: int, 
             rho0, alpha0, p0 = to_map(rho, alpha, p, estimate, np.diag(POSE_SIGMA**2))
             alpha_m = alpha_t + true_pose[2]
             rho_m = rho_t + true_pose[0] * math.cos(alpha_m) + true_pose[1] * math.sin(alpha_m)
-            at = true_pose[:2] + [c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]]
+            at = true_pose[:2] + np.array([c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]])
             moved.append(nees(rho0, alpha0, p0, (rho_m, alpha_m), at if centroid else np.zeros(2)))
     return {"own": np.mean(own), "moved": np.mean(moved), "found": found / (scans * len(walls))}
 

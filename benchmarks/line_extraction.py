@@ -37,10 +37,14 @@ def office(rng: np.random.Generator) -> tuple[np.ndarray, shapely.Polygon]:
             parts.append(shapely.box(door, min(0, near), door + 0.9, max(0, near)))
             if rng.random() < 0.6:  # a cupboard against the far wall
                 left, deep = x + rng.uniform(0.2, width - 1.4), rng.uniform(0.3, 0.6)
-                furniture.append(shapely.box(left, min(far, far - sign * deep), left + 1.2, max(far, far - sign * deep)))
+                furniture.append(
+                    shapely.box(left, min(far, far - sign * deep), left + 1.2, max(far, far - sign * deep))
+                )
             if rng.random() < 0.3:  # a door to the next room
                 at = near + sign * rng.uniform(0.5, depth - 1.5)
-                parts.append(shapely.box(x + width - 0.1, min(at, at + sign), x + width + thickness + 0.1, max(at, at + sign)))
+                parts.append(
+                    shapely.box(x + width - 0.1, min(at, at + sign), x + width + thickness + 0.1, max(at, at + sign))
+                )
             x += width + thickness
     parts.append(shapely.box(0.0, -0.5 * corridor, 20.0, 0.5 * corridor))
     free = shapely.union_all(parts).difference(shapely.union_all(furniture))
@@ -50,7 +54,9 @@ def office(rng: np.random.Generator) -> tuple[np.ndarray, shapely.Polygon]:
     return np.vstack([np.hstack([r[:-1], r[1:]]) for r in rings]), free
 
 
-def scans(count: int, sensor: SensorConfig, rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def scans(
+    count: int, sensor: SensorConfig, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Walls in the robot frame, noise-free ranges and noisy ranges of so many scans."""
     out = []
     while len(out) < count:

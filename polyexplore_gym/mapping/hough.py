@@ -172,9 +172,9 @@ def settle(
             t = y[k] * ca[i] - x[k] * sa[i]
             low[i], high[i] = min(low[i], t), max(high[i], t)
     for k in range(x.size):
-        best, least = label[k], math.inf
-        if best < 0:
+        if label[k] < 0:
             continue
+        best, least = -1, math.inf
         for i in range(count):
             t = y[k] * ca[i] - x[k] * sa[i]
             if not low[i] - 0.3 * reach <= t <= high[i] + 0.3 * reach:
@@ -183,4 +183,5 @@ def settle(
             z2 = e * e / normal_variance(x[k], y[k], ca[i], sa[i], var_range, var_angle)
             if z2 < least:
                 best, least = i, z2
-        label[k] = best
+        if best >= 0:
+            label[k] = best

@@ -45,7 +45,11 @@ class LineMap:
         self._rows, self._lines = _rows(256), _lines(128)
         self._grid = empty_grid(256)
         self._slots = Slots(
-            np.empty(256, np.int64), np.empty(128, np.int64), np.zeros(4, np.int64), np.empty(256, np.int64)
+            np.empty(256, np.int64),
+            np.empty(128, np.int64),
+            np.zeros(4, np.int64),
+            np.empty(256, np.int64),
+            np.empty(256, np.int64),
         )
         self._release(0, 256, 0, 128)
 
@@ -76,7 +80,7 @@ class LineMap:
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self.config.door_width,
             self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
-        touched = np.sort(slots.touched[: slots.count[3]])
+        touched = np.sort(slots.touched[: slots.counts[3]])
         if touched.size:
             self._row_count = max(self._row_count, int(touched[-1]) + 1)
         used = np.flatnonzero(self._lines.alive[self._line_count : self._line_count + lines.rho.size + 1])
@@ -86,7 +90,7 @@ class LineMap:
 
     @property
     def segments(self) -> np.ndarray:
-        """(M, 4) end points of all rows, m; the free space they were seen from lies on the left. Rows not alive: stale."""
+        """(M, 4) end points of all rows, m; the free space lies on the left. Stale where not alive."""
         return self._rows.segments[: self._row_count]
 
     @property
@@ -138,9 +142,9 @@ class LineMap:
         """Make room for so many more rows and lines."""
         old_rows, old_lines = self._rows.alive.size, self._lines.alive.size
         new_rows, new_lines = old_rows, old_lines
-        while self._slots.count[0] + new_rows - old_rows < rows + 1:
+        while self._slots.counts[0] + new_rows - old_rows < rows + 1:
             new_rows *= 2
-        while self._slots.count[1] + new_lines - old_lines < lines + 1:
+        while self._slots.counts[1] + new_lines - old_lines < lines + 1:
             new_lines *= 2
         if new_rows == old_rows and new_lines == old_lines:
             return
@@ -150,13 +154,14 @@ class LineMap:
         self._slots = Slots(
             _grown(s.rows, np.empty(new_rows, np.int64)),
             _grown(s.lines, np.empty(new_lines, np.int64)),
-            s.count,
+            s.counts,
+            np.empty(new_rows, np.int64),
             np.empty(new_rows, np.int64),
         )
         self._release(old_rows, new_rows, old_lines, new_lines)
         if new_rows > old_rows:
             self._grid = empty_grid(new_rows)
-            for row in np.flatnonzero(self._rows.alive):
+            for row in np.flatnonzero(self._rows.alive).tolist():
                 grid_put(self._grid, row, *self._rows.segments[row])
 
     def _release(self, row0: int, row1: int, line0: int, line1: int) -> None:
@@ -166,10 +171,10 @@ class LineMap:
             (s.rows, 0, range(row1 - 1, row0 - 1, -1)),
             (s.lines, 1, range(line1 - 1, line0 - 1, -1)),
         ):
-            n = int(s.count[which])
+            n = int(s.counts[which])
             stack[len(new) : len(new) + n] = stack[:n].copy()
             stack[: len(new)] = new
-            s.count[which] = n + len(new)
+            s.counts[which] = n + len(new)
 
 
 def _grown(old: np.ndarray, new: np.ndarray) -> np.ndarray:

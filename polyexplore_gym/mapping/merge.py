@@ -58,10 +58,12 @@ class Slots(NamedTuple):
 
     rows: np.ndarray
     lines: np.ndarray
-    count: np.ndarray
+    counts: np.ndarray
     """Number of free rows, free lines, inserts so far, touched rows of this insert."""
     touched: np.ndarray
     """Rows touched in this insert."""
+    found: np.ndarray
+    """Scratch for the answers of the spatial index."""
 
 
 @njit(cache=True)
@@ -89,16 +91,16 @@ def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray) -> None
 
 @njit(cache=True)
 def touch(rows: Rows, slots: Slots, row: int) -> None:
-    if rows.touched[row] != slots.count[2]:
-        rows.touched[row] = slots.count[2]
-        slots.touched[slots.count[3]] = row
-        slots.count[3] += 1
+    if rows.touched[row] != slots.counts[2]:
+        rows.touched[row] = slots.counts[2]
+        slots.touched[slots.counts[3]] = row
+        slots.counts[3] += 1
 
 
 @njit(cache=True)
 def new_row(rows: Rows, slots: Slots) -> int:
-    slots.count[0] -= 1
-    row = slots.rows[slots.count[0]]
+    slots.counts[0] -= 1
+    row = slots.rows[slots.counts[0]]
     rows.alive[row] = True
     rows.segments[row] = math.inf
     return row
@@ -109,8 +111,8 @@ def free_row(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
     rows.alive[row] = False
     rows.line[row] = -1
     rows.side[row] = 0
-    slots.rows[slots.count[0]] = row
-    slots.count[0] += 1
+    slots.rows[slots.counts[0]] = row
+    slots.counts[0] += 1
     grid_remove(grid, row)
     touch(rows, slots, row)
 
@@ -118,8 +120,8 @@ def free_row(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
 @njit(cache=True)
 def free_line(lines: Lines, slots: Slots, line: int) -> None:
     lines.alive[line] = False
-    slots.lines[slots.count[1]] = line
-    slots.count[1] += 1
+    slots.lines[slots.counts[1]] = line
+    slots.counts[1] += 1
 
 
 @njit(cache=True)
@@ -346,7 +348,7 @@ def clear_covered(
     row = lines.first[line]
     while row >= 0:
         w = rows.segments[row]
-        fresh = rows.touched[row] == slots.count[2]
+        fresh = rows.touched[row] == slots.counts[2]
         length = math.hypot(w[2] - w[0], w[3] - w[1])
         for q in range(box_query(grid, w, 0.5, found) if fresh else 0):
             f = found[q]
@@ -379,7 +381,7 @@ def covered(
     tolerance = COVER + 3.0 * sigma
     n = box_query(grid, s, tolerance + 0.5, found)
     length = math.hypot(s[2] - s[0], s[3] - s[1])
-    steps = max(1, int(math.ceil(length / 0.05)))
+    steps = max(1, math.ceil(length / 0.05))
     first, last = 2.0, -1.0
     for i in range(steps + 1):
         t = i / steps
@@ -424,12 +426,12 @@ def insert(
     slots: Slots,
 ) -> None:
     """Insert one scan's lines and fragments; the touched rows are left in `slots`."""
-    slots.count[2] += 1
-    slots.count[3] = 0
-    stamp = slots.count[2]
+    slots.counts[2] += 1
+    slots.counts[3] = 0
+    stamp = slots.counts[2]
     sigma_range = math.sqrt(var_range)
     n = rho.size
-    found = np.empty(rows.alive.size, np.int64)
+    found = slots.found
     match = np.empty((32, 4))
     rho, alpha, covariance, of = rho.copy(), alpha.copy(), covariance.copy(), segment_line.copy()
 
@@ -521,8 +523,8 @@ def insert(
         if m == 0:
             continue
         if target < 0:
-            slots.count[1] -= 1
-            target = slots.lines[slots.count[1]]
+            slots.counts[1] -= 1
+            target = slots.lines[slots.counts[1]]
             lines.alive[target] = True
             lines.first[target] = -1
         store(lines, target, r0, a0, p0)

@@ -178,7 +178,7 @@ def test_bad_input_is_named():
         extract_lines(HALF, nan)
     negative = good.copy()
     negative[3] = -1
-    with pytest.raises(ValueError, match="beam 3 is -1.0"):
+    with pytest.raises(ValueError, match=r"beam 3 is -1\.0"):
         extract_lines(HALF, negative)
     with pytest.raises(ValueError, match="361 and 360"):
         extract_lines(HALF, good[:-1])

@@ -31,10 +31,17 @@ def twin(x, y, var_range, var_angle, alpha):
     p = np.array([x.mean() * math.cos(alpha) + y.mean() * math.sin(alpha), alpha])
     for _ in range(60):
         weight = 1 / np.sqrt(
-            [normal_variance(a, b, math.cos(p[1]), math.sin(p[1]), var_range, var_angle) for a, b in zip(x, y, strict=True)]
+            [
+                normal_variance(a, b, math.cos(p[1]), math.sin(p[1]), var_range, var_angle)
+                for a, b in zip(x, y, strict=True)
+            ]
         )
         p = least_squares(
-            lambda q, w=weight: w * (x * math.cos(q[1]) + y * math.sin(q[1]) - q[0]), p, xtol=1e-14, ftol=1e-14, gtol=1e-14
+            lambda q, w=weight: w * (x * math.cos(q[1]) + y * math.sin(q[1]) - q[0]),
+            p,
+            xtol=1e-14,
+            ftol=1e-14,
+            gtol=1e-14,
         ).x
     return p, float(np.sum((weight * (x * math.cos(p[1]) + y * math.sin(p[1]) - p[0])) ** 2))
 
@@ -78,7 +85,7 @@ def test_covariance_is_consistent(name):
     c, s = math.cos(pose[2]), math.sin(pose[2])
     alpha_map = true[1] + pose[2]
     true_map = (true[0] + pose[0] * math.cos(alpha_map) + pose[1] * math.sin(alpha_map), alpha_map)
-    middle_map = pose[:2] + [c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]]
+    middle_map = pose[:2] + np.array([c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]])
     own, moved = [], []
     for _ in range(600):
         lines = extract_lines(HALF, measure([wall], np.zeros(3), sensor, rng), sensor)
@@ -111,7 +118,7 @@ def test_to_map_is_the_matrix_formula(seed):
     t = rng.uniform(-3, 3)
     q = np.array([rho * math.cos(alpha) - t * math.sin(alpha), rho * math.sin(alpha) + t * math.cos(alpha)])
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    m = pose[:2] + [c * q[0] - s * q[1], s * q[0] + c * q[1]]
+    m = pose[:2] + np.array([c * q[0] - s * q[1], s * q[0] + c * q[1]])
     assert m[0] * math.cos(alpha0) + m[1] * math.sin(alpha0) == pytest.approx(rho0, abs=1e-10)
     assert -math.pi < alpha0 <= math.pi
 

@@ -1,22 +1,330 @@
-"""LineMap: merging across scans, sides, doorways, slots."""
+"""LineMap: merging across scans, sides, doorways, slots, touched rows; the index against brute force."""
+
+import math
 
 import numpy as np
+import pytest
+from line_scenes import EXACT, HALF, box, distance, ends_on, jagged_room, measure
+from test_fit import nees, polar
 
-from polyexplore_gym.config import SensorConfig
-from polyexplore_gym.mapping import LineMap, extract_lines
+from polyexplore_gym.config import MappingConfig, SensorConfig
+from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
+from polyexplore_gym.mapping.fit import to_map, wrap
+from polyexplore_gym.mapping.grid import empty_grid, grid_put, grid_query, grid_remove
+from polyexplore_gym.mapping.merge import candidates, oriented
+
+SENSOR = SensorConfig()
+FIVE = SensorConfig(sigma_range=0.05, sigma_angle=math.radians(0.5))
+POSE_SIGMA = np.array([0.02, 0.02, math.radians(0.5)])
+
+
+def look(line_map, walls, pose, rng, sigma=None):
+    pose = np.asarray(pose, float)
+    lines = extract_lines(HALF, measure(walls, pose, line_map.sensor, rng), line_map.sensor, line_map.config)
+    if sigma is None:
+        return line_map.insert(lines, pose, EXACT)
+    return line_map.insert(lines, pose + rng.normal(0, sigma), np.diag(sigma**2))
+
+
+def explored(walls, sensor, seed, scans=40, sigma=None, reach=2.0):
+    rng = np.random.default_rng(seed)
+    line_map = LineMap(sensor=sensor)
+    for _ in range(scans):
+        look(line_map, walls, [*rng.uniform(-reach, reach, 2), rng.uniform(-math.pi, math.pi)], rng, sigma)
+    return line_map
+
+
+def check_slots(line_map):
+    """Rows, lines and their links agree."""
+    alive, line = line_map.alive, line_map.line
+    used = np.unique(line[alive & (line >= 0)])
+    np.testing.assert_array_equal(used, np.flatnonzero(line_map.line_alive))
+    assert (line_map.rho[used] >= 0).all()
+    assert np.isfinite(line_map.segments[alive]).all()
+    for row in np.flatnonzero(alive & (line >= 0)):
+        j = line[row]
+        assert line_map.side[row] == line_map.line_side[j]
+        c, s = math.cos(line_map.alpha[j]), math.sin(line_map.alpha[j])
+        off = line_map.segments[row].reshape(2, 2) @ [c, s] - line_map.rho[j]
+        assert np.abs(off).max() < 2.1e-3
+        assert np.linalg.eigvalsh(line_map.covariance[j]).min() > 0
+    assert (line_map.side[alive & (line < 0)] == 0).all()
+    rows = line_map._rows
+    for j in used:
+        chain, row = [], line_map._lines.first[j]
+        while row >= 0:
+            chain.append(row)
+            row = rows.next[row]
+        np.testing.assert_array_equal(np.sort(chain), np.flatnonzero(alive & (line == j)))
 
 
 def test_a_room_seen_again_keeps_its_rows():
-    sensor = SensorConfig()
+    line_map = explored(box(-3, -2.5, 3, 2.5), SENSOR, 0)
+    assert line_map.alive.sum() == line_map.line_alive.sum() == 4
+    np.testing.assert_allclose(np.sort(line_map.rho[line_map.line_alive]), [2.5, 2.5, 3, 3], atol=0.005)
+    rows = np.flatnonzero(line_map.alive)
+    look(line_map, box(-3, -2.5, 3, 2.5), (0, 0, 0), np.random.default_rng(9))
+    np.testing.assert_array_equal(rows, np.flatnonzero(line_map.alive))
+    check_slots(line_map)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.05, 0.15])
+def test_two_faces_of_a_thin_wall_never_merge(gap):
     rng = np.random.default_rng(0)
-    angles = np.linspace(-np.pi / 2, np.pi / 2, 361)
+    walls = [[2, -3, 2, 3], [2 + gap, 3, 2 + gap, -3], *box(-1, -3, 5, 3)]
+    line_map = LineMap(sensor=FIVE)
+    for _ in range(10):
+        look(line_map, walls, (0, 0, 0), rng)
+        look(line_map, walls, (4, 0, math.pi), rng)
+    faces = np.abs(line_map.segments[:, [0, 2]] - 2 - gap / 2).max(1) < 0.15
+    faces &= line_map.alive & (np.hypot(*(line_map.segments[:, 2:] - line_map.segments[:, :2]).T) > 3)
+    assert sorted(line_map.side[faces]) == [-1, 1]
+    assert line_map.line[faces][0] != line_map.line[faces][1]
+    # free space on the left: the face seen from the left runs up, the other one down
+    up = line_map.segments[faces][:, 3] > line_map.segments[faces][:, 1]
+    np.testing.assert_array_equal(up, line_map.side[faces] == 1)
+
+
+def test_a_line_behind_the_origin_is_stored_with_positive_rho():
+    """Robot beyond the wall's foot: rho0 < 0, so alpha turns by pi and the covariance's sign with it."""
+    wall, values = [2.0, 3.0, -2.0, 3.0], []
+    rng = np.random.default_rng(3)
+    for _ in range(400):
+        line_map = LineMap(sensor=SENSOR)
+        look(line_map, [wall], (1.0, 5.0, -math.pi / 2), rng, POSE_SIGMA)
+        assert line_map.line_alive.sum() == 1
+        assert line_map.line_side[0] == -1
+        assert line_map.rho[0] > 0
+        values.append(nees(line_map.rho[0], line_map.alpha[0], line_map.covariance[0], polar(wall), np.zeros(2)))
+    assert 1.7 < np.mean(values) < 2.4
+
+
+def test_merged_lines_are_consistent():
+    walls = [[-3, -2.5, 3, -2.5], [3, -2.5, 3, 2.5], [3, 2.5, -3, 2.5], [-3, 2.5, -3, -2.5]]
+    values = []
+    for seed in range(100):
+        line_map = explored(walls, SENSOR, seed, scans=8, sigma=POSE_SIGMA, reach=1.5)
+        for row in np.flatnonzero(line_map.alive & (line_map.line >= 0)):
+            j, s = line_map.line[row], line_map.segments[row]
+            at = 0.5 * (s[:2] + s[2:])
+            values.append(
+                min(nees(line_map.rho[j], line_map.alpha[j], line_map.covariance[j], polar(w), at) for w in walls)
+            )
+    assert 1.75 < np.mean(values) < 2.4
+
+
+def test_a_doorway_stays_open_and_separate_walls_share_a_line():
+    walls = [[3, -2.5, 3, -0.45], [3, 0.45, 3, 2.5], [6, -4, 6, 4], *box(-3, -2.5, 3, 2.5)[2:]]
+    rng = np.random.default_rng(0)
+    line_map = LineMap(sensor=FIVE)
+    for _ in range(60):
+        look(line_map, walls, (rng.uniform(-2, 2), rng.uniform(-1.5, 1.5), rng.uniform(-0.7, 0.7)), rng)
+    segments = line_map.segments[line_map.alive]
+    opening = np.c_[np.full(9, 3.0), np.linspace(-0.3, 0.3, 9)]
+    assert distance(opening, segments).min() > 0.1
+    check_slots(line_map)
+
+
+def test_the_gate_is_the_configured_one():
+    """The paper's gate of 3 keeps fewer pairs together than 9.21: more lines."""
+    counts = []
+    for gate in (3.0, 9.21):
+        rng = np.random.default_rng(1)
+        found = 0
+        for _ in range(60):
+            line_map = LineMap(MappingConfig(merge_gate=gate), SENSOR)
+            r0, a0, p0 = to_map(2.0, 0.0, np.diag([1e-5, 1e-5]), np.zeros(3), EXACT)
+            a = ScanLines(
+                np.array([r0]), np.array([a0]), p0[None], np.array([[2.0, -1.0, 2.0, 1.0]]), np.zeros(1, int),
+                np.zeros(0, int), np.zeros((0, 4)), np.zeros(0),
+            )  # fmt: skip
+            line_map.insert(a, np.zeros(3), EXACT)
+            rho, alpha = r0 + rng.normal(0, math.sqrt(1e-5)), a0 + rng.normal(0, math.sqrt(1e-5))
+            b = ScanLines(np.array([rho]), np.array([alpha]), *[getattr(a, f) for f in a.__slots__[2:]])
+            line_map.insert(b, np.zeros(3), EXACT)
+            found += np.trace(line_map.covariance[0]) < 1.5e-5  # merged: half the variance
+        counts.append(found)
+    assert counts[0] < counts[1]
+    assert counts[1] >= 55
+
+
+@pytest.mark.parametrize("sensor", [SENSOR, FIVE])
+@pytest.mark.parametrize("seed", range(3))
+def test_touched_rows_are_exactly_what_changed(sensor, seed):
+    walls = np.vstack([jagged_room(np.random.default_rng(seed)), box(0.4, 1.0, 0.6, 1.2), box(-1.6, -1.2, -1.2, -1.1)])
+    rng = np.random.default_rng(seed)
     line_map = LineMap(sensor=sensor)
-    for _ in range(5):
-        c, s = np.cos(angles + rng.normal(0, sensor.sigma_angle, 361)), np.sin(angles)
-        ranges = np.min(np.where(c > 1e-9, 3 / c, np.inf)[None] * 1, axis=0)
-        ranges = np.minimum(ranges, np.where(s > 1e-9, 2 / np.maximum(s, 1e-9), np.inf))
-        ranges = np.minimum(ranges, np.where(s < -1e-9, 2.5 / np.maximum(-s, 1e-9), np.inf))
-        ranges = ranges + rng.normal(0, sensor.sigma_range, 361)
-        line_map.insert(extract_lines(angles, ranges, sensor), np.zeros(3), np.zeros((3, 3)))
-    assert line_map.alive.sum() == 3
-    np.testing.assert_allclose(np.sort(line_map.rho), [2.0, 2.5, 3.0], atol=0.01)
+    for _ in range(60):
+        before, alive = line_map.segments.copy(), line_map.alive.copy()
+        touched = look(line_map, walls, [*rng.uniform(-1, 1, 2), rng.uniform(-math.pi, math.pi)], rng)
+        assert (np.diff(touched) > 0).all()
+        same = np.setdiff1d(np.arange(alive.size), touched)
+        np.testing.assert_array_equal(line_map.segments[same], before[same])
+        np.testing.assert_array_equal(line_map.alive[same], alive[same])
+        assert np.isin(np.arange(alive.size, line_map.alive.size), touched).all()
+        for row in touched[touched < alive.size]:
+            if alive[row] and line_map.alive[row]:
+                moved = np.hypot(*(line_map.segments[row] - before[row]).reshape(2, 2).T)
+                assert moved.max() >= 2e-3
+        check_slots(line_map)
+
+
+@pytest.mark.parametrize("sensor", [SENSOR, FIVE])
+def test_the_map_holds_every_obstacle_and_no_phantom(sensor):
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        walls = np.vstack([jagged_room(rng), box(0.5, 1.0, 0.9, 1.3), box(-1.6, -1.2, -1.2, -1.1)])
+        line_map, points = LineMap(sensor=sensor), []
+        for _ in range(30):
+            pose = np.array([rng.uniform(-1, 0.3), rng.uniform(-0.8, 0.8), rng.uniform(-math.pi, math.pi)])
+            quiet = SensorConfig(sigma_range=0.0, sigma_angle=0.0)
+            points.append(ends_on(HALF, measure(walls, pose, quiet, rng), pose))
+            look(line_map, walls, pose, rng)
+        pieces = line_map.segments[line_map.alive]
+        off = distance(np.vstack(points), pieces)
+        scale = 0.1 if sensor is SENSOR else 0.2
+        assert np.mean(off > scale) < 0.005
+        t = np.linspace(0, 1, 40)[:, None, None]
+        samples = (pieces[:, :2] + t * (pieces[:, 2:] - pieces[:, :2])).reshape(-1, 2)
+        assert distance(samples, walls).max() < 2 * scale
+
+
+def test_fragments_give_way_to_walls():
+    rng = np.random.default_rng(0)
+    line_map = LineMap(sensor=SENSOR)
+    wall = [[2, -3, 2, 3]]
+    few = np.where(np.abs(HALF) < 0.02, measure(wall, np.zeros(3), SENSOR, rng), np.inf)
+    line_map.insert(extract_lines(HALF, few, SENSOR), np.zeros(3), EXACT)
+    assert list(line_map.line[line_map.alive]) == [-1]
+    touched = look(line_map, wall, (0, 0, 0), rng)
+    assert (line_map.line[line_map.alive] >= 0).all()
+    assert len(touched) == 2 or line_map.alive.sum() == 1
+    again = line_map.insert(extract_lines(HALF, few, SENSOR), np.zeros(3), EXACT)
+    assert again.size == 0  # known: within 4 cm + 3 sigma of the wall
+
+
+def test_grid_finds_whatever_meets_the_box():
+    rng = np.random.default_rng(0)
+    grid, segments, alive = empty_grid(300), np.zeros((300, 4)), np.zeros(300, bool)
+    found = np.empty(300, np.int64)
+    for _ in range(3000):
+        row = rng.integers(300)
+        if alive[row] and rng.random() < 0.4:
+            grid_remove(grid, row)
+            alive[row] = False
+        else:
+            p = rng.uniform(-40, 40, 2)
+            segments[row] = [*p, *(p + rng.normal(0, 10.0 ** rng.uniform(-2, 1.3), 2))]
+            grid_put(grid, row, *segments[row])
+            alive[row] = True
+        x, y = rng.uniform(-40, 40, 2)
+        w, h = rng.uniform(0, 6, 2)
+        got = found[: grid_query(grid, x, y, x + w, y + h, found)]
+        assert got.size == np.unique(got).size
+        low, high = np.minimum(segments[:, :2], segments[:, 2:]), np.maximum(segments[:, :2], segments[:, 2:])
+        meets = alive & (high >= [x, y]).all(1) & (low <= [x + w, y + h]).all(1)
+        assert set(np.flatnonzero(meets)) <= set(got)
+        assert alive[got].all()
+
+
+def brute_force(line_map, rho, alpha, p, segments):
+    """All map lines that pass the merge test, every row looked at, matrices written out."""
+    u, passed = np.array([-math.sin(alpha), math.cos(alpha)]), {}
+    for row in np.flatnonzero(line_map.alive & (line_map.line >= 0)):
+        j, r = line_map.line[row], line_map.segments[row]
+        rho_j, alpha_j, p_j = oriented(line_map._lines, j)
+        if abs(wrap(alpha - alpha_j)) > 0.5:
+            continue
+        for s in segments:
+            a, b = np.sort([s[:2] @ u, s[2:] @ u]), np.sort([r[:2] @ u, r[2:] @ u])
+            if max(b[0] - a[1], a[0] - b[1]) >= line_map.config.door_width:
+                continue
+            # only rows near the segment's box count, as the merge rule asks for
+            low, high = np.minimum(s[:2], s[2:]) - 0.5, np.maximum(s[:2], s[2:]) + 0.5
+            if (np.maximum(r[:2], r[2:]) < low).any() or (np.minimum(r[:2], r[2:]) > high).any():
+                continue
+            m = 0.25 * (s[:2] + s[2:] + r[:2] + r[2:])
+            lines = []
+            for q, t, c in ((rho, alpha, p), (rho_j, alpha_j, p_j)):
+                h = np.array([[1, 0], [m[0] * math.sin(t) - m[1] * math.cos(t), 1]])
+                lines.append((np.array([t, q - m @ [math.cos(t), math.sin(t)]]), h @ c @ h.T))
+            d = lines[0][0] - lines[1][0]
+            d[0] = wrap(d[0])
+            d2 = d @ np.linalg.solve(lines[0][1] + lines[1][1], d)
+            if d2 < line_map.config.merge_gate:
+                passed.setdefault(j, []).append(d2)
+    return passed
+
+
+def test_index_and_brute_force_find_the_same_partners():
+    rng = np.random.default_rng(2)
+    walls = jagged_room(rng)
+    line_map = explored(walls, SENSOR, 2, scans=30, reach=1.0)
+    found, out, partners = np.empty(4096, np.int64), np.empty((32, 4)), 0
+    for _ in range(30):
+        pose = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-math.pi, math.pi)])
+        lines = extract_lines(HALF, measure(walls, pose, SENSOR, rng), SENSOR)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        turn = np.array([[c, -s], [s, c]])
+        placed = np.hstack([lines.segments[:, :2] @ turn.T + pose[:2], lines.segments[:, 2:] @ turn.T + pose[:2]])
+        for i in range(lines.rho.size):
+            line = to_map(lines.rho[i], lines.alpha[i], lines.covariance[i], pose, EXACT)
+            n, _ = candidates(
+                *line, placed, lines.segment_line, i, line_map._rows, line_map._lines, line_map._grid,
+                line_map.config.merge_gate, line_map.config.door_width, found, out,
+            )  # fmt: skip
+            expected = brute_force(line_map, *line, placed[lines.segment_line == i])
+            # the index may offer a few lines more, whose rows lie just outside the box
+            assert set(expected) <= set(out[:n, 0].astype(int))
+            assert (np.diff(out[:n, 1]) >= 0).all()
+            for j, d2 in zip(out[:n, 0].astype(int), out[:n, 1], strict=True):
+                if j in expected:
+                    assert np.isclose(expected[j], d2, rtol=1e-6).any()
+                    partners += 1
+    assert partners > 50
+
+
+def test_the_cost_of_a_query_does_not_grow_with_the_map():
+    """Rows visited near one place: the same with 100 and with 10,000 rows elsewhere."""
+    visited = []
+    for copies in (1, 100):
+        grid, found = empty_grid(100 * copies), np.empty(100 * copies, np.int64)
+        rng = np.random.default_rng(0)
+        local = rng.uniform(0, 10, (100, 2))
+        for k in range(copies):
+            for i, p in enumerate(local):
+                grid_put(grid, 100 * k + i, p[0] + 50 * k, p[1], p[0] + 50 * k + 1, p[1])
+        visited.append(grid_query(grid, 2, 2, 5, 5, found))
+    assert visited[0] == visited[1] > 0
+
+
+def test_many_rows_grow_the_store():
+    line_map, rng = LineMap(sensor=SENSOR), np.random.default_rng(0)
+    room = box(-3, -2.5, 3, 2.5)
+    for k in range(120):
+        shift = np.array([20.0 * (k % 12), 20.0 * (k // 12)])
+        look(line_map, np.array(room) + np.tile(shift, 2), [*shift, 0.3 * k], rng)
+    assert line_map.alive.sum() > 256
+    assert line_map.line_alive.sum() > 256
+    check_slots(line_map)
+    before = line_map.alive.sum()
+    touched = look(line_map, room, (0, 0, 0.0), rng)
+    assert line_map.alive.sum() - before <= 1
+    assert touched.size <= 5
+
+
+def test_the_same_scans_give_the_same_map():
+    a, b = (explored(jagged_room(np.random.default_rng(4)), FIVE, 4, reach=1.0) for _ in range(2))
+    for name in ("segments", "alive", "line", "side", "rho", "alpha", "covariance", "line_alive"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_empty_scans_and_bad_poses():
+    line_map = LineMap()
+    nothing = extract_lines(HALF, np.full(361, np.inf))
+    assert line_map.insert(nothing, np.zeros(3), EXACT).size == 0
+    assert line_map.segments.shape == (0, 4)
+    with pytest.raises(ValueError, match="must be"):
+        line_map.insert(nothing, np.zeros(2), EXACT)
+    with pytest.raises(ValueError, match="finite"):
+        line_map.insert(nothing, np.array([0, np.nan, 0]), EXACT)
