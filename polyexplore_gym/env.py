@@ -116,7 +116,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._trajectory = [pose[None]]
         self._measured_at: list[np.ndarray] = []
         self._chosen: int | None = None
-        self._over = False
+        self._felt: float | None = None
         self._look_around()
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
         self._observe()
@@ -206,8 +206,15 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         assert self._world is not None
         true_path[0] = self._world.pose[:2]
         arrived = self._drive(true_path, turn)
+        if self._felt is not None:
+            estimate = self._pose_model.estimate
+            exploration.bump(estimate, self._felt + estimate[2])
+        if not arrived:
+            # A bump ends the drive, but the robot can still look where it wanted to.
+            self._drive(self._world.pose[None, :2], turn)
         self._measure(self._world.pose, target, arrived=arrived)
-        exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
+        came = self._pose_model.to_estimated(self._trajectory[-1 if arrived else -2][:, :2])
+        exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive, came)
 
     def _drive(self, path: np.ndarray, heading: float) -> bool:
         """Drive; scans on the way are taken without stopping. Whether the end was reached."""
@@ -228,6 +235,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._distance += result.distance
         self._sim_time += result.duration
         self._collisions += int(result.collided)
+        self._felt = result.contact
         return result.arrived
 
     def _measure(self, pose: np.ndarray, target: int | None, *, arrived: bool) -> None:

@@ -152,6 +152,52 @@ def clip(pieces, apexes, headings, points, rays, first, last, angles, full, reac
 
 
 @njit(cache=True)
+def clip_known(pieces, known, margin, shortest):
+    """What is left of pieces (m, 4) beside `known` ones (k, 4) that run along them and face the same way.
+
+    The same discontinuity seen again is the same jump edge. Returns the rest and where each came from.
+    """
+    m = pieces.shape[0]
+    out = np.empty((2 * m + 64, 4))
+    origin = np.empty(out.shape[0], np.int64)
+    kept = np.empty((_MAX_INTERVALS, 2))
+    cut = np.empty((1, 2))
+    count = 0
+    for i in range(m):
+        ax, ay, bx, by = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
+        size = math.hypot(bx - ax, by - ay)
+        kept[0, 0] = 0.0
+        kept[0, 1] = 1.0
+        n_kept = 1
+        for w in range(known.shape[0]):
+            if (
+                max(known[w, 0], known[w, 2]) < min(ax, bx) - margin
+                or min(known[w, 0], known[w, 2]) > max(ax, bx) + margin
+                or max(known[w, 1], known[w, 3]) < min(ay, by) - margin
+                or min(known[w, 1], known[w, 3]) > max(ay, by) + margin
+                or (known[w, 2] - known[w, 0]) * (bx - ax) + (known[w, 3] - known[w, 1]) * (by - ay) <= 0.0
+            ):
+                continue
+            lo, hi = _covered(ax, ay, bx, by, known[w], margin)
+            if hi > lo:
+                cut[0, 0] = lo
+                cut[0, 1] = hi
+                n_kept = subtract(kept, n_kept, cut, 1)
+                if n_kept == 0:
+                    break
+        for r in range(n_kept):
+            whole = kept[r, 1] - kept[r, 0] == 1.0
+            if (whole or (kept[r, 1] - kept[r, 0]) * size >= shortest) and count < out.shape[0]:
+                out[count, 0] = ax + kept[r, 0] * (bx - ax)
+                out[count, 1] = ay + kept[r, 0] * (by - ay)
+                out[count, 2] = ax + kept[r, 1] * (bx - ax)
+                out[count, 3] = ay + kept[r, 1] * (by - ay)
+                origin[count] = i
+                count += 1
+    return out[:count].copy(), origin[:count].copy()
+
+
+@njit(cache=True)
 def touching_chains(pieces, chain, dirty, tolerance):
     """Chains (ids) of clean pieces with an end near an end of a dirty piece that it could join."""
     n = pieces.shape[0]

@@ -5,6 +5,7 @@ Sees scans, pose estimates and fitted walls; never the floor plan.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -122,7 +123,9 @@ class ExplorationMap:
         self.chains = Chains.none()
         self.graph = PathGraph(radius, _SPARE, 0.01)
         self.robot = -1
+        self._start: list[tuple[float, float]] = []
         self._next_id = 0
+        self.bumps = np.zeros((0, 4))
         self._touched: list[np.ndarray] = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
 
@@ -170,6 +173,8 @@ class ExplorationMap:
 
         local = _near(self.pieces, np.ones(len(self.pieces), np.bool_), x, y, reach)
         kept, origin, changed = self._clip(self.pieces[local], s, s + 1, near_walls)
+        fresh, again = jump_edges.clip_known(fresh, kept, self.nudge, 0.02)
+        fresh_kinds = fresh_kinds[again]
         dirty = np.zeros(len(self.pieces), np.bool_)
         dirty[local[changed]] = True
         if target is not None:
@@ -289,20 +294,37 @@ class ExplorationMap:
             keep = np.flatnonzero(g.sources != v)
             g.sources, g.dist, g.parent = g.sources[keep], g.dist[keep], g.parent[keep]
 
+    def bump(self, pose: np.ndarray, bearing: float) -> None:
+        """Remember an obstacle felt at `bearing` (rad, map frame) on the robot's rim at `pose` (3,): plan around it."""
+        c, s = math.cos(bearing), math.sin(bearing)
+        x, y = pose[0] + self.graph.radius * c, pose[1] + self.graph.radius * s
+        felt = np.array([[x + 0.01 * s, y - 0.01 * c, x - 0.01 * s, y + 0.01 * c]])
+        self.bumps = np.concatenate((self.bumps, felt))
+
     # Nodes and paths -------------------------------------------------------------------------
 
-    def plan(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> None:
-        """Bring nodes, gains and shortest paths up to date for a robot at the estimated `pose` (3,)."""
+    def plan(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray, came: np.ndarray | None = None) -> None:
+        """Bring nodes, gains and shortest paths up to date for a robot at the estimated `pose` (3,).
+
+        `came` (k, 2) is the way that it came, the way back out of a tight place.
+        """
         g = self.graph
         c = self.chains
         if self._touched:
             touched = np.unique(np.concatenate(self._touched))
+            if len(self.bumps):
+                # Felt obstacles come first: their rows never shift when the line map grows.
+                walls = np.concatenate((self.bumps, walls))
+                alive = np.concatenate((np.ones(len(self.bumps), np.bool_), alive))
+                touched = np.concatenate((np.arange(len(self.bumps)), touched + len(self.bumps)))
             g.set_walls(walls, alive, touched)
             g.set_pieces(self.pieces, self.owner)
+            g.add_way_point(float(pose[0]), float(pose[1]))
             g.refresh(self._box, _SLACK)
         if self.robot >= 0:
             g.remove_leaf(self.robot)
-        self.robot = g.add_leaf(float(pose[0]), float(pose[1]), -2, _SLACK)
+        self._start = self._way_out(float(pose[0]), float(pose[1]), came)
+        self.robot = g.add_leaf(*self._start[-1], -2, _SLACK)
         reach = self.sensor.max_range
         x0, y0, x1, y1 = self._box
         local = (
@@ -332,6 +354,22 @@ class ExplorationMap:
         self._touched = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
 
+    def _way_out(self, x: float, y: float, came: np.ndarray | None) -> list[tuple[float, float]]:
+        """The first way points: the place itself or, in contact with a wall, on to where paths begin."""
+        rx, ry, found = self.graph.retreat(x, y)
+        if found:
+            return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
+        points = [(x, y)]
+        if came is not None:
+            driven = 0.0
+            for i in range(len(came) - 2, -1, -1):
+                p = (float(came[i, 0]), float(came[i, 1]))
+                driven += math.dist(p, points[-1])
+                points.append(p)
+                if self.graph.clearance(*p) >= self.graph.need or driven > 1.0:
+                    break
+        return points
+
     def _update_sources(self) -> None:
         g, c = self.graph, self.chains
         rows = np.flatnonzero(c.vertex >= 0)
@@ -341,7 +379,9 @@ class ExplorationMap:
             g.set_sources(vertices, np.array([row_of.get(int(v), -1) for v in vertices], np.int64))
         g.repair()
         c.path_length[:] = math.inf
-        c.path_length[rows] = g.dist[:, self.robot]
+        c.path_length[rows] = g.dist[:, self.robot] + sum(
+            math.dist(a, b) for a, b in itertools.pairwise(self._start)
+        )
 
     def _rows(self, chain: int) -> np.ndarray:
         return np.flatnonzero(self.owner == chain)
@@ -386,7 +426,7 @@ class ExplorationMap:
     def path_to(self, i: int) -> np.ndarray:
         """Way points (k, 2) of the shortest path from the robot to node i."""
         row = int(np.flatnonzero(self.graph.sources == self.chains.vertex[i])[0])
-        return self.graph.path(row, self.robot)
+        return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), self.graph.path(row, self.robot)))
 
     def path_lengths(self, rows: np.ndarray) -> np.ndarray:
         """Path lengths (k, k) between the nodes `rows`, m; inf where there is no path."""

@@ -25,18 +25,26 @@ from polyexplore_gym.exploration.segments import (
 DEAD, OPEN, BLOCKED = 0, 1, 2
 CORNER, LEAF = 0, 1
 
-REACH = 0.8
+REACH = 0.45
 """Margin (m) of the wall grid: no clearance beyond it is ever asked for."""
 _NEIGHBOURHOOD = 0.25
 """Radius (m) of the circle around a wall end on which its corner is judged: raggedness below it is no corner."""
 _SPACING = 0.1
 """Two vertices nearer than this (m) are one."""
-_MAX_EDGE = 20.0
+_MAX_EDGE = 12.0
 """Longest edge of the graph, m."""
 _FLAT = 0.2
 """A corner that turns less than this (rad) beyond straight gets no vertex."""
 _ARC = math.pi / 4
 """A path turns round a corner in steps of at most this angle, rad."""
+_WAY_POINT = 4.0
+"""Where no corner stands within this distance (m) of a scan, the scan's place becomes a vertex itself."""
+_LEEWAY = 0.12
+"""Sine by which a path through a corner vertex may miss being taut: the map is noisy."""
+_FREE = 2.0
+"""Stands for the largest sine where a vertex serves every direction past its corner."""
+_ANY = 4.0
+"""Stands for the largest sine of a vertex in the open, without a corner."""
 
 
 @njit(cache=True)
@@ -89,10 +97,11 @@ def _free_sector(ex, ey, walls, start, items):
 
 @njit(cache=True)
 def corner_vertices(ends, walls, start, items, rho, need):
-    """Vertices around wall ends (m, 2): (v, 2) positions and (v, 7) anchor and bounding wall directions.
+    """Vertices around wall ends (m, 2): (v, 2) positions and (v, 7) shapes for the test of tautness.
 
     They stand at `rho` from the end on a polyline around it, nearer where the passage is narrow but
-    never nearer than `need` to any wall. Column 6 is 1 where the directions prune, 0 where not.
+    never nearer than `need` to any wall. A shape is the anchor (the wall end), the two bounding wall
+    directions, and the sine of the largest angle between a taut path and the polyline's tangent.
     """
     out = np.empty((16 * ends.shape[0], 2))
     shape = np.empty((out.shape[0], 7))
@@ -107,13 +116,19 @@ def corner_vertices(ends, walls, start, items, rho, need):
             continue
         parts = int(math.ceil(turn / _ARC - 1e-9))
         first = a if lone else a + 0.5 * math.pi
+        last_kept = True
         for p in range(parts):
-            direction = first + (p + 0.5) * turn / parts
+            if count == out.shape[0]:
+                break
+            half = 0.5 * turn / parts
+            direction = first + (2 * p + 1) * half
             ux = math.cos(direction)
             uy = math.sin(direction)
-            away = rho / math.cos(0.5 * turn / parts)
+            away = rho / math.cos(half)
             x = ex + away * ux
             y = ey + away * uy
+            limit = math.sin(half) + _LEEWAY
+            kept = True
             if clearance(x, y, walls, start, items, REACH) < need:
                 # A narrow passage: stand in the middle between the end and what faces it.
                 low = -1.0
@@ -124,10 +139,14 @@ def corner_vertices(ends, walls, start, items, rho, need):
                         low = c
                         x = ex + d * ux
                         y = ey + d * uy
-                if low < 0.0:
-                    continue
-            if count == out.shape[0]:
-                break
+                limit = _FREE
+                kept = low >= 0.0
+            if not kept:
+                # The neighbour on the polyline takes over its directions.
+                if last_kept and p > 0:
+                    shape[count - 1, 6] = _FREE
+                last_kept = False
+                continue
             out[count, 0] = x
             out[count, 1] = y
             shape[count, 0] = ex
@@ -136,47 +155,109 @@ def corner_vertices(ends, walls, start, items, rho, need):
             shape[count, 3] = math.sin(a)
             shape[count, 4] = math.cos(b)
             shape[count, 5] = math.sin(b)
-            shape[count, 6] = 0.0 if lone else 1.0
+            shape[count, 6] = limit if last_kept else _FREE
+            last_kept = True
             count += 1
     return out[:count].copy(), shape[:count].copy()
 
 
 @njit(cache=True)
-def distinct(candidates, position, kind, n_vertices):
-    """Which candidates (m, 2) stand clear of all living corner vertices and of earlier candidates."""
+def retire(position, kind, shape, n_vertices, touched, walls, start, items, need):
+    """Retire the corners that the `touched` walls (m, 4) changed; the wall ends (k, 2) to judge anew."""
+    again = np.empty((n_vertices, 2))
+    count = 0
+    if touched.shape[0] == 0:
+        return again[:0].copy()
+    reach = 2.0 * _NEIGHBOURHOOD
+    x0 = min(touched[:, 0].min(), touched[:, 2].min()) - reach
+    x1 = max(touched[:, 0].max(), touched[:, 2].max()) + reach
+    y0 = min(touched[:, 1].min(), touched[:, 3].min()) - reach
+    y1 = max(touched[:, 1].max(), touched[:, 3].max()) + reach
+    for v in range(n_vertices):
+        if kind[v] != CORNER:
+            continue
+        ex = shape[v, 0]
+        ey = shape[v, 1]
+        if ex < x0 or ex > x1 or ey < y0 or ey > y1:
+            continue
+        near = False
+        for w in range(touched.shape[0]):
+            if point_segment_distance(ex, ey, touched[w, 0], touched[w, 1], touched[w, 2], touched[w, 3]) < reach:
+                near = True
+                break
+        if not near:
+            continue
+        a, b, gap = _free_sector(ex, ey, walls, start, items)
+        same = (
+            shape[v, 2] * math.cos(a) + shape[v, 3] * math.sin(a) > 0.99
+            and shape[v, 4] * math.cos(b) + shape[v, 5] * math.sin(b) > 0.99
+        )
+        if same and clearance(position[v, 0], position[v, 1], walls, start, items, REACH) >= need - 0.005:
+            continue
+        # The vertices of one wall end serve together: judge it anew as a whole.
+        for u in range(n_vertices):
+            if kind[u] == CORNER and shape[u, 0] == ex and shape[u, 1] == ey:
+                kind[u] = -1
+        again[count, 0] = ex
+        again[count, 1] = ey
+        count += 1
+    return again[:count].copy()
+
+
+@njit(cache=True)
+def distinct(candidates, forms, position, shape, kind, n_vertices):
+    """Which candidates (m, 2) with `forms` (m, 7) add to the living corner vertices and to earlier candidates.
+
+    One that stands beside another of the same corner and looks the same way adds nothing; the other
+    then serves a wider range of directions.
+    """
     m = candidates.shape[0]
     keep = np.ones(m, np.bool_)
     for i in range(m):
         x = candidates[i, 0]
         y = candidates[i, 1]
+        rx = x - forms[i, 0]
+        ry = y - forms[i, 1]
+        r = math.hypot(rx, ry)
         for v in range(n_vertices):
-            if kind[v] == CORNER and abs(position[v, 0] - x) < _SPACING and abs(position[v, 1] - y) < _SPACING:
+            if kind[v] != CORNER or abs(position[v, 0] - x) > _SPACING or abs(position[v, 1] - y) > _SPACING:
+                continue
+            if math.hypot(position[v, 0] - x, position[v, 1] - y) > _SPACING:
+                continue
+            qx = position[v, 0] - shape[v, 0]
+            qy = position[v, 1] - shape[v, 1]
+            if rx * qx + ry * qy > 0.9 * r * math.hypot(qx, qy):
                 keep[i] = False
+                shape[v, 6] = max(shape[v, 6], forms[i, 6] + _LEEWAY)
                 break
         for j in range(i):
-            if (
-                keep[i]
-                and keep[j]
-                and abs(candidates[j, 0] - x) < _SPACING
-                and abs(candidates[j, 1] - y) < _SPACING
-            ):
+            if not (keep[i] and keep[j]):
+                continue
+            if math.hypot(candidates[j, 0] - x, candidates[j, 1] - y) > _SPACING:
+                continue
+            qx = candidates[j, 0] - forms[j, 0]
+            qy = candidates[j, 1] - forms[j, 1]
+            if rx * qx + ry * qy > 0.9 * r * math.hypot(qx, qy):
                 keep[i] = False
-                break
+                forms[j, 6] = max(forms[j, 6], forms[i, 6] + _LEEWAY)
     return keep
 
 
 @njit(cache=True, inline="always")
 def _tangent(dx, dy, x, y, shape):
-    """Whether a path in direction d through a corner vertex can be taut: all of the corner on one side."""
-    if shape[6] == 0.0:
+    """Whether a path in direction d (a unit vector) through a corner vertex can be taut."""
+    if shape[6] >= _ANY:
         return True
-    side = dx * (shape[1] - y) - dy * (shape[0] - x)
-    slack = 0.1 * (abs(dx) + abs(dy))
+    rx = x - shape[0]
+    ry = y - shape[1]
+    if abs(dx * rx + dy * ry) > shape[6] * math.hypot(rx, ry):
+        return False
+    side = dy * rx - dx * ry
     c1 = dx * shape[3] - dy * shape[2]
     c2 = dx * shape[5] - dy * shape[4]
     if side > 0.0:
-        return c1 >= -slack and c2 >= -slack
-    return c1 <= slack and c2 <= slack
+        return c1 >= -_LEEWAY and c2 >= -_LEEWAY
+    return c1 <= _LEEWAY and c2 <= _LEEWAY
 
 
 @njit(cache=True)
@@ -207,12 +288,13 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             dy = position[v, 1] - uy
             if abs(dx) > _MAX_EDGE or abs(dy) > _MAX_EDGE:
                 continue
-            if kind[u] == CORNER and not _tangent(dx, dy, ux, uy, shape[u]):
-                continue
-            if kind[v] == CORNER and not _tangent(dx, dy, position[v, 0], position[v, 1], shape[v]):
-                continue
             d = math.hypot(dx, dy)
             if d > _MAX_EDGE:
+                continue
+            d1 = max(d, 1e-9)
+            if kind[u] == CORNER and not _tangent(dx / d1, dy / d1, ux, uy, shape[u]):
+                continue
+            if kind[v] == CORNER and not _tangent(dx / d1, dy / d1, position[v, 0], position[v, 1], shape[v]):
                 continue
             want = min(need, relaxed[u], relaxed[v])
             if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
@@ -268,12 +350,13 @@ def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shap
     """Kill the corner vertices and the edges that new walls (m, 4) come too near to; the edges that were open."""
     killed = np.empty(n_edges, np.int64)
     count = 0
-    if walls.shape[0] == 0:
-        return killed[:0].copy()
-    x0 = min(walls[:, 0].min(), walls[:, 2].min()) - need
-    x1 = max(walls[:, 0].max(), walls[:, 2].max()) + need
-    y0 = min(walls[:, 1].min(), walls[:, 3].min()) - need
-    y1 = max(walls[:, 1].max(), walls[:, 3].max()) + need
+    x0 = y0 = math.inf
+    x1 = y1 = -math.inf
+    for w in range(walls.shape[0]):
+        x0 = min(x0, walls[w, 0] - need, walls[w, 2] - need)
+        x1 = max(x1, walls[w, 0] + need, walls[w, 2] + need)
+        y0 = min(y0, walls[w, 1] - need, walls[w, 3] - need)
+        y1 = max(y1, walls[w, 1] + need, walls[w, 3] + need)
     for v in range(n_vertices):
         x = position[v, 0]
         y = position[v, 1]
@@ -478,6 +561,47 @@ def repair(dist, parent, sources, killed, added, ends, state, length, head, nxt,
 
 
 @njit(cache=True)
+def retreat(x, y, walls, start, items, need):
+    """The nearest place with clearance `need` to go to from (x, y) leaving all near walls: (x, y, found).
+
+    A robot that bumped stands closer to a wall than paths do, and the map is only good to
+    millimetres: sliding along the wall would bump again.
+    """
+    mask = start.size - 2
+    b = ((int(math.floor(x)) * 73856093) ^ (int(math.floor(y)) * 19349663)) & mask
+    for step in range(1, 11):
+        d = 0.04 * step
+        best = need
+        bx = x
+        by = y
+        for k in range(32):
+            ux = math.cos(k * math.pi / 16)
+            uy = math.sin(k * math.pi / 16)
+            c = clearance(x + d * ux, y + d * uy, walls, start, items, REACH)
+            if c < best:
+                continue
+            away = True
+            for e in range(start[b], start[b + 1]):
+                w = walls[items[e]]
+                near = point_segment_distance(x, y, w[0], w[1], w[2], w[3])
+                if near < need and (
+                    point_segment_distance(x + 0.02 * ux, y + 0.02 * uy, w[0], w[1], w[2], w[3]) < near + 0.006
+                ):
+                    away = False
+                    break
+                if segment_distance(x, y, x + d * ux, y + d * uy, w[0], w[1], w[2], w[3]) < min(near, need) - 1e-6:
+                    away = False
+                    break
+            if away:
+                best = c + 1e-9
+                bx = x + d * ux
+                by = y + d * uy
+        if best > need:
+            return bx, by, True
+    return x, y, False
+
+
+@njit(cache=True)
 def reachable(root, ends, state, head, nxt, kind, n_vertices):
     """Which vertices an open path joins to `root`."""
     seen = np.zeros(n_vertices, np.bool_)
@@ -524,7 +648,7 @@ class PathGraph:
         self.state = np.zeros(1024, np.int8)
         self.wants = np.zeros(1024)
         self.nxt = np.full(2048, -1, np.int64)
-        self.free_ids: list[int] = []
+        self.free_ids = np.zeros(0, np.int64)
         self._fresh = np.zeros(0, np.int64)
         self.sources = np.zeros(0, np.int64)
         self.dist = np.zeros((0, 256))
@@ -544,15 +668,18 @@ class PathGraph:
         self.walls = walls
         self.wall_grid = build_grid(walls, alive, REACH)
         rows = touched[alive[touched]]
+        again = retire(
+            self.position, self.kind, self.shape, self.n_vertices, walls[touched], walls, *self.wall_grid, self.need
+        )
         killed = block_by_walls(
             self.ends, self.state, self.wants, self.n_edges, self.position, self.kind, self.n_vertices, self.shape,
             walls[rows], self.need,
         )  # fmt: skip
         if killed.size:
             self._killed.append(killed)
-        ends = np.concatenate((walls[rows, :2], walls[rows, 2:]))
+        ends = np.concatenate((again, walls[rows, :2], walls[rows, 2:]))
         candidates, shape = corner_vertices(ends, walls, *self.wall_grid, self.rho, self.need)
-        keep = distinct(candidates, self.position, self.kind, self.n_vertices)
+        keep = distinct(candidates, shape, self.position, self.shape, self.kind, self.n_vertices)
         self._fresh = self._new_vertices(candidates[keep], shape[keep])
 
     def set_pieces(self, pieces: np.ndarray, owner: np.ndarray) -> None:
@@ -580,6 +707,13 @@ class PathGraph:
             repair(self.dist, self.parent, self.sources, killed, added, self.ends, self.state, self.length,
                    self.head, self.nxt, self.kind)  # fmt: skip
 
+    def add_way_point(self, x: float, y: float) -> None:
+        """Make a place where the robot stood a vertex, if corners are far: halls have none in their middle."""
+        near = np.abs(self.position[: self.n_vertices] - (x, y)).max(axis=1) < _WAY_POINT
+        if not (near & (self.kind[: self.n_vertices] == CORNER)).any():
+            shape = np.array([[x + 1e6, y, 1.0, 0.0, 1.0, 0.0, _ANY]])
+            self._fresh = np.concatenate((self._fresh, self._new_vertices(np.array([[x, y]]), shape)))
+
     # Vertices --------------------------------------------------------------------------------
 
     def clearance(self, x: float, y: float) -> float:
@@ -603,16 +737,15 @@ class PathGraph:
         self.kind[v] = -1
         self.dist[:, v] = math.inf
         self.parent[:, v] = -1
-        self.free_ids.append(v)
 
     def _new_vertices(self, position: np.ndarray, shape: np.ndarray, kind: int = CORNER, owner: int = -1) -> np.ndarray:
         m = len(position)
-        if kind == LEAF and self.free_ids:
-            ids = np.array([self.free_ids.pop() for _ in range(m)])
-        else:
-            self._grow_vertices(self.n_vertices + m)
-            ids = np.arange(self.n_vertices, self.n_vertices + m)
-            self.n_vertices += m
+        reused = self.free_ids[:m]
+        self.free_ids = self.free_ids[m:]
+        fresh = m - len(reused)
+        self._grow_vertices(self.n_vertices + fresh)
+        ids = np.concatenate((reused, np.arange(self.n_vertices, self.n_vertices + fresh)))
+        self.n_vertices += fresh
         self.position[ids] = position
         self.shape[ids] = shape
         self.kind[ids] = kind
@@ -664,7 +797,8 @@ class PathGraph:
         self._added.append(np.arange(first, self.n_edges))
 
     def compact(self) -> None:
-        """Drop dead edges and give back the indices of removed leaves. Call after `repair`."""
+        """Drop dead edges and free the indices of dead vertices. Call after `repair`."""
+        self.free_ids = np.flatnonzero(self.kind[: self.n_vertices] < 0)
         alive = np.flatnonzero(self.state[: self.n_edges])
         if len(alive) > 0.6 * self.n_edges or self.n_edges < 512:
             return
@@ -677,6 +811,12 @@ class PathGraph:
         self.n_edges = n
         self.head[:] = -1
         link_edges(self.ends, 0, n, self.head, self.nxt)
+
+    def retreat(self, x: float, y: float) -> tuple[float, float, bool]:
+        """Where to go first from a place nearer to a wall than paths are, and whether there is such a place."""
+        if self.clearance(x, y) >= self.need:
+            return x, y, True
+        return retreat(x, y, self.walls, *self.wall_grid, self.need)
 
     # Fields ----------------------------------------------------------------------------------
 

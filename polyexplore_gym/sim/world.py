@@ -42,6 +42,8 @@ class DriveResult:
     """Simulated time, s."""
     collided: bool
     """Whether a wall ended the drive."""
+    contact: float | None
+    """Where on the rim a bump was felt: bearing in the robot frame, rad; None without a bump."""
     arrived: bool
     """Whether the end of the path and the heading were reached; False after a bump or at the time limit."""
 
@@ -130,6 +132,13 @@ class World:
                 keep.append(i)
         return way if len(keep) == len(way) else np.ascontiguousarray(way[keep])
 
+    def _contact(self, collided: bool) -> float | None:
+        """What a ring of bumpers feels: the bearing of the nearest wall in the robot frame."""
+        if not collided:
+            return None
+        _, px, py = nearest_wall(self._walls, self._pose[0], self._pose[1])
+        return wrap(math.atan2(py - self._pose[1], px - self._pose[0]) - self._pose[2])
+
     def _glide(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
         trajectory, distance, duration, collided, arrived = glide(
             self._walls,
@@ -143,7 +152,9 @@ class World:
         )
         trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
         self._pose = trajectory[-1].copy()
-        return DriveResult(trajectory, float(distance), float(duration), bool(collided), bool(arrived))
+        return DriveResult(
+            trajectory, float(distance), float(duration), bool(collided), self._contact(collided), bool(arrived)
+        )
 
     def _follow(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
         robot, step = self.robot, self.config.time_step
@@ -182,7 +193,9 @@ class World:
         away = math.hypot(self._pose[0] - path[-1, 0], self._pose[1] - path[-1, 1]) > _ARRIVED
         arrived = bool(state[follower.PHASE] == follower.DONE) and not away
         collided = collided or (ended and not arrived)  # nothing but a wall keeps the follower from its goal
-        return DriveResult(trajectory, float(way_length(trajectory)), done * step, bool(collided), arrived)
+        return DriveResult(
+            trajectory, float(way_length(trajectory)), done * step, bool(collided), self._contact(collided), arrived
+        )
 
     def _settle(self, trajectory: np.ndarray, walls: np.ndarray) -> np.ndarray:
         """Move the last pose out of the walls by what the contact left of penetration, some millimetres at most.
