@@ -112,7 +112,7 @@ def take_dominant(
         votes[i] = 0
         if index.size < min_points:
             continue
-        rho, alpha, paa, par, prr, chi2 = fit(x, y, index, var_range, var_angle)
+        rho, alpha, _, _, _, _ = fit(x, y, index, var_range, var_angle)
         # points of lines impossible beside it, then all points within 3 sigma, as far as they hang together
         for _ in range(2):
             ca, sa = math.cos(alpha), math.sin(alpha)
@@ -138,14 +138,15 @@ def take_dominant(
             for k in range(x.size):
                 t = y[k] * ca - x[k] * sa
                 e = x[k] * ca + y[k] * sa - rho
-                if label[k] < 0 and low - RASTER <= t <= high + RASTER:
-                    if e * e <= NEAR * normal_variance(x[k], y[k], ca, sa, var_range, var_angle):
-                        index[n] = k
-                        n += 1
+                if label[k] >= 0 or not low - RASTER <= t <= high + RASTER:
+                    continue
+                if e * e <= NEAR * normal_variance(x[k], y[k], ca, sa, var_range, var_angle):
+                    index[n] = k
+                    n += 1
             index = index[:n]
             if n < min_points:
                 break
-            rho, alpha, paa, par, prr, chi2 = fit(x, y, index, var_range, var_angle)
+            rho, alpha, _, _, _, _ = fit(x, y, index, var_range, var_angle)
         if index.size < min_points or high - low < min_length:
             continue
         for k in index:
@@ -175,13 +176,13 @@ def settle(
         if label[k] < 0:
             continue
         best, least = -1, math.inf
-        for i in range(count):
-            t = y[k] * ca[i] - x[k] * sa[i]
-            if not low[i] - 0.3 * reach <= t <= high[i] + 0.3 * reach:
+        for j in range(count):
+            t = y[k] * ca[j] - x[k] * sa[j]
+            if not low[j] - 0.3 * reach <= t <= high[j] + 0.3 * reach:
                 continue
-            e = x[k] * ca[i] + y[k] * sa[i] - rho[i]
-            z2 = e * e / normal_variance(x[k], y[k], ca[i], sa[i], var_range, var_angle)
+            e = x[k] * ca[j] + y[k] * sa[j] - rho[j]
+            z2 = e * e / normal_variance(x[k], y[k], ca[j], sa[j], var_range, var_angle)
             if z2 < least:
-                best, least = i, z2
+                best, least = j, z2
         if best >= 0:
             label[k] = best
