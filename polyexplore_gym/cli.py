@@ -149,7 +149,7 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation import load_policy, run_episode
     from polyexplore_gym.evaluation.runner import make_env
 
-    _check_outputs(options)
+    _check_run(options)
     config = _config(options.config, options.drive, options.placement)
     plan = _plan(options.plan)
     policy = load_policy(options.policy)
@@ -302,8 +302,8 @@ def _bench_plots(study: Study, records: list[EpisodeRecord], summary: Summary, o
     return written
 
 
-def _check_outputs(options: Run) -> None:
-    """Reject a file that could not be written before the exploration, not after it."""
+def _check_run(options: Run) -> None:
+    """Reject what cannot work, such as a file that cannot be written, before the exploration and not after it."""
     for path, suffixes in ((options.gif, (".gif",)), (options.mp4, (".mp4",)), (options.png, (".png", ".pdf", ".svg"))):
         if path is None:
             continue
@@ -311,6 +311,8 @@ def _check_outputs(options: Run) -> None:
             raise InvalidConfigError(f"{path}: the name must end in {' or '.join(suffixes)}")
         if not path.parent.is_dir():
             raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+    if options.seed < 0:
+        raise InvalidConfigError(f"--seed {options.seed}: must not be negative")
     if options.step < 0 or 0 < options.step < 0.02:
         raise InvalidConfigError(f"--step {options.step}: must be 0 or at least 0.02")
     if not 0.1 <= options.fps <= 100:

@@ -315,8 +315,8 @@ def _notes(
     short = sum(r.complete for r in here) - sum(r.placement == placement for r in completed(records))
     if short:
         notes.append(
-            f"{placement}: {short} episodes ended having seen over {100 * SHORTFALL:.0f} % less of the plan than others "
-            "did on it: stopped short, not complete"
+            f"{placement}: {short} episodes ended having seen over {100 * SHORTFALL:.0f} % less of a plan than others "
+            "did: stopped short, not complete"
         )
     cut = sum(r.cut_nodes > 0 or r.cut_lines > 0 for r in here)
     if cut:

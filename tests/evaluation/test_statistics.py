@@ -124,6 +124,11 @@ def test_signed_rank_is_that_of_the_buildings():
     assert signed_rank_p(differences, alone) == pytest.approx(scipy.stats.wilcoxon(differences).pvalue)
     twice = np.concatenate([differences + 0.1, differences - 0.1])  # two runs a building do not make it surer
     assert signed_rank_p(twice, alone * 2) == pytest.approx(scipy.stats.wilcoxon(differences).pvalue)
+    for n in range(2, 14):  # exact, with ties and zeros
+        rounded = np.round(rng.normal(0.5, 1.0, size=n), 1)
+        rounded[0] = 0.0
+        if rounded.any():
+            assert signed_rank_p(rounded, alone[:n]) == pytest.approx(scipy.stats.wilcoxon(rounded).pvalue)
     assert signed_rank_p(np.zeros(5), alone[:5]) == 1.0
     assert np.isnan(signed_rank_p(np.array([1.0, 2.0]), ["a", "a"]))
 

@@ -1,0 +1,216 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polyexplore_gym.cli import BENCH_PLANS, SCRIPTED, main
+from polyexplore_gym.evaluation import read_manifest, read_records
+from polyexplore_gym.floorplan import FloorPlan, save_plan
+
+ROOMS = [[0, 0], [9, 0], [9, 4], [5, 4], [5, 6], [9, 6], [9, 9], [0, 9], [0, 5], [3, 5], [3, 4], [0, 4]]
+
+
+class Broken:
+    """A policy of a user's own, with a fault."""
+
+    def act(self, observation, info, rng):
+        raise KeyError("weights")
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Two plans, one of them twice, a broken one and what is no plan at all."""
+    plans = tmp_path / "plans"
+    plans.mkdir()
+    save_plan(FloorPlan.create(ROOMS, name="rooms"), plans / "rooms.json")
+    save_plan(FloorPlan.create(ROOMS, name="again"), plans / "zz_again.json")
+    save_plan(FloorPlan.create(np.array(ROOMS) * 0.8, name="small"), plans / "small.geojson")
+    (plans / "bow_tie.json").write_text(json.dumps({"exterior": [[0, 0], [2, 2], [2, 0], [0, 2]]}))
+    (plans / "half.json").write_text('{"exterior": [[0, 0], [')
+    (plans / "README.md").write_text("no plan")
+    return plans
+
+
+def bench(*arguments: object) -> int:
+    return main(["bench", "--drive", "kinematic", "--workers", "1", *map(str, arguments)])
+
+
+def test_help_is_light():
+    code = (
+        "import sys, polyexplore_gym.cli\n"
+        "heavy = {'torch', 'matplotlib', 'numba', 'shapely', 'cv2', 'scipy', 'pygame', 'pymunk', 'joblib'}\n"
+        "sys.exit(' '.join(heavy & set(sys.modules)) or 0)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    result = subprocess.run(
+        [sys.executable, "-m", "polyexplore_gym.cli", "bench", "--help"], capture_output=True, text=True
+    )
+    assert result.returncode == 0
+    assert "--placements" in result.stdout
+
+
+def test_a_folder_is_compared(folder, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ("--plans", folder, "--policies", "nearest", "random", "--seeds", 2, "--out", out)
+    assert bench(*arguments) == 0
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert any(line.startswith("left out:") and "bow_tie.json" in line for line in lines)
+    assert any(line.startswith("left out:") and "half.json" in line for line in lines)
+    assert any(line.startswith("left out:") and "zz_again.json: the same geometry as" in line for line in lines)
+    assert "README" not in captured.err
+    assert "2 plans x 2 starts x 2 placements x 2 policies = 16 episodes" in captured.err
+    records = read_records(out)
+    assert len(records) == 16
+    assert {r.status for r in records} == {"complete"}
+    assert {r.drive for r in records} == {"kinematic"}
+    assert {r.plan for r in records} == {"rooms", "small"}
+    assert {p["name"] for p in read_manifest(out)["study"]["plans"]} == {"rooms", "small"}
+    assert min(r.coverage for r in records) > 0.97
+    for name in ("coverage.png", "ratios.png", "trajectories-midpoint.png", "trajectories-in_front.png"):
+        assert (out / name).stat().st_size > 5000
+    # What is printed is what the records say.
+    nearest = [r.distance for r in records if (r.policy, r.placement) == ("nearest", "midpoint")]
+    row = next(line.split() for line in captured.out.splitlines() if line.startswith("midpoint   nearest"))
+    assert float(row[3]) == pytest.approx(np.mean(nearest), abs=0.051)
+    # The same start for all: coverage is the same before the first decision.
+    starts = {(r.plan, r.seed, r.curve_coverage[0]) for r in records}
+    assert len(starts) == 4
+    # Once more: nothing is left to run, and the tables are the same but for nothing.
+    assert bench(*arguments, "--no-plots") == 0
+    assert capsys.readouterr().out == captured.out
+    # Another study does not get in.
+    assert bench(*arguments[:-3], 3, "--out", out) == 2
+    assert "study.seeds" in capsys.readouterr().err
+
+
+def test_no_usable_plan_is_an_error(folder, tmp_path, capsys):
+    for bad in (folder / "bow_tie.json", folder / "README.md", tmp_path / "missing.json"):
+        assert bench("--plans", bad, "--out", tmp_path / "out") == 2
+        error = capsys.readouterr().err
+        assert f"left out: {bad}" in error
+        assert error.splitlines()[-1].startswith("error: no usable floor plan")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["bench", "--suite", "home-tset"], "home-tset"),
+        (["bench", "--suite", "home-test", "--plans", "x.json"], "either"),
+        (["bench", "--seeds", "0"], "--seeds 0"),
+        (["bench", "--first", "0"], "--first 0"),
+        (["bench", "--policies", "neerest"], "neerest"),
+        (["bench", "--policies", "nearest", "nearest"], "two policies"),
+        (["bench", "--config", "nowhere.json"], "nowhere.json"),
+        (["run", "home-test/50"], "0 to 49"),
+        (["run", "nowhere.json"], "nowhere.json"),
+        (["run", "home-test/0", "--policy", "no.module:x"], "no.module"),
+        (["run", "home-test/0", "--gif", "film.mov"], "film.mov"),
+        (["run", "home-test/0", "--png", "nowhere/x.png"], "nowhere"),
+        (["run", "home-test/0", "--start", "-50", "0", "0"], "start"),
+        (["run", "home-test/0", "--step", "-1"], "--step"),
+        (["run", "home-test/0", "--seed", "-1"], "seed"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("error: ")
+    assert message in last
+
+
+def test_a_configuration_file(folder, tmp_path, capsys):
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"sensor": {"beams": 181}, "drive": {"mode": "kinematic"}}))
+    arguments = [
+        "--plans",
+        str(folder / "rooms.json"),
+        "--policies",
+        "nearest",
+        "--placements",
+        "in_front",
+        "--no-plots",
+    ]
+    out = tmp_path / "out"
+    assert main(["bench", *arguments, "--config", str(config), "--workers", "1", "--out", str(out)]) == 0
+    assert read_manifest(out)["study"]["config"]["sensor"]["beams"] == 181
+    assert {(r.placement, r.drive) for r in read_records(out)} == {("in_front", "kinematic")}
+    config.write_text(json.dumps({"sensor": {"beems": 181}}))
+    assert main(["bench", *arguments, "--config", str(config)]) == 2
+    error = capsys.readouterr().err
+    assert "beems" in error
+    assert "config.json.sensor" in error
+
+
+def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):
+    from PIL import Image
+
+    arguments = ["run", str(folder / "rooms.json"), "--drive", "kinematic", "--start", "1", "1", "90"]
+    assert main(arguments) == 0
+    plain = capsys.readouterr().out
+    assert "rooms" in plain
+    assert "complete" in plain
+    files = {kind: tmp_path / f"film.{kind}" for kind in ("gif", "mp4", "png")}
+    options = [text for kind, path in files.items() for text in (f"--{kind}", str(path))]
+    assert main([*arguments, *options, "--width", "240", "--step", "0"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(plain)
+    decisions = int(plain.split(" decisions")[0].split()[-1])
+    with Image.open(files["gif"]) as film:
+        assert film.n_frames >= decisions
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(film.n_frames - 1)
+        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - first).max() > 50
+    assert files["mp4"].stat().st_size > 2000
+    with Image.open(files["png"]) as picture:
+        assert picture.size[0] == 240
+
+
+def test_an_own_policy_that_fails_is_told(folder, capsys):
+    assert main(["run", str(folder / "rooms.json"), "--policy", f"{__name__}:Broken", "--drive", "kinematic"]) == 1
+    assert "failed: KeyError: 'weights'" in capsys.readouterr().out
+
+
+def test_without_matplotlib_there_are_tables(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    out = tmp_path / "out"
+    assert bench("--plans", folder / "rooms.json", "--policies", "nearest", "--out", out) == 0
+    captured = capsys.readouterr()
+    assert "polyexplore-gym[plots]" in captured.err
+    assert "nearest" in captured.out
+    assert (out / "summary.csv").exists()
+
+
+def test_control_c_says_how_to_go_on(folder, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "polyexplore_gym.cli", "bench", "--plans", str(folder), "--seeds", "400"]
+    command += ["--drive", "kinematic"]
+    process = subprocess.Popen(
+        [*command, "--out", str(out), "--workers", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    while process.poll() is None and not (out / "episodes.jsonl").exists():
+        os.sched_yield()
+    while process.poll() is None and (out / "episodes.jsonl").stat().st_size == 0:
+        os.sched_yield()
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130, error
+    assert "the same command goes on from there" in error
+    assert "Traceback" not in error
+    assert read_records(out)
+
+
+def test_the_default_bench_exists():
+    from baselines import policy_names
+    from polyexplore_gym.floorplan import suite
+
+    assert set(SCRIPTED) == set(policy_names())
+    assert all(0 < count <= len(suite(name)) for name, count in BENCH_PLANS.items())
