@@ -84,7 +84,7 @@ def extract_lines(
     problem, beam = _check(angles, ranges)
     if problem:
         raise ValueError(_PROBLEMS[problem].format(beam=beam, angle=angles[beam], range=ranges[beam]))
-    sigma_range = max(math.hypot(sensor.sigma_range, config.range_floor), LEAST_RANGE_NOISE)
+    sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE)
     sigma_angle = max(sensor.sigma_angle, LEAST_ANGLE_NOISE)
     start, points = _returns(angles, ranges, sensor.max_range, sensor.full_circle)
     resolution = (angles[-1] - angles[0]) / (angles.size - 1) if angles.size > 1 else sensor.resolution

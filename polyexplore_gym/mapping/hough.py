@@ -169,8 +169,8 @@ def settle(
         rho[i], alpha, _, _, _, _ = fit(x, y, index, var_range, var_angle)
         ca[i], sa[i] = math.cos(alpha), math.sin(alpha)
         low[i], high[i] = math.inf, -math.inf
-        for k in index:
-            t = y[k] * ca[i] - x[k] * sa[i]
+        for q in index:
+            t = y[q] * ca[i] - x[q] * sa[i]
             low[i], high[i] = min(low[i], t), max(high[i], t)
     for k in range(x.size):
         if label[k] < 0:

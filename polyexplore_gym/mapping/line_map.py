@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
@@ -39,7 +37,7 @@ class LineMap:
     def __init__(self, config: MappingConfig | None = None, sensor: SensorConfig | None = None) -> None:
         self.config = MappingConfig() if config is None else config
         self.sensor = SensorConfig() if sensor is None else sensor
-        self._var_range = max(math.hypot(self.sensor.sigma_range, self.config.range_floor), LEAST_RANGE_NOISE) ** 2
+        self._var_range = max(self.sensor.sigma_range, self.config.range_floor, LEAST_RANGE_NOISE) ** 2
         self._var_angle = max(self.sensor.sigma_angle, LEAST_ANGLE_NOISE) ** 2
         self._row_count = self._line_count = 0
         self._rows, self._lines = _rows(256), _lines(128)
