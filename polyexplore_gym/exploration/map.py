@@ -21,6 +21,8 @@ _PIECE = 2.0
 """Open edges are cut into pieces of at most this length, m."""
 _SLACK = 0.3
 """Paths may cross an open edge this near (m) to the node or robot at their end."""
+_TRAIL_STEP = 0.2
+"""Spacing of the way points on a way driven, m."""
 _SPARE = 0.05
 """Paths round corners keep this much more than the robot's radius, m."""
 
@@ -42,6 +44,13 @@ def _near(segments, alive, x, y, reach):
             rows[count] = i
             count += 1
     return rows[:count].copy()
+
+
+def _resampled(way: np.ndarray) -> np.ndarray:
+    """Points (k, 2) of a way, the first, the last and about every `_TRAIL_STEP` m between."""
+    run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
+    at = np.linspace(0.0, run[-1], max(math.ceil(run[-1] / _TRAIL_STEP), 1) + 1)
+    return np.stack((np.interp(at, run, way[:, 0]), np.interp(at, run, way[:, 1])), axis=1)
 
 
 @dataclass(slots=True)
@@ -121,11 +130,12 @@ class ExplorationMap:
         self.done = np.zeros(0, np.bool_)
         self.owner = np.zeros(0, np.int64)
         self.chains = Chains.none()
-        self.graph = PathGraph(radius, _SPARE, 0.01)
+        self.graph = PathGraph(radius, _SPARE, 0.012)
         self.robot = -1
         self._start: list[tuple[float, float]] = []
         self._next_id = 0
         self.bumps = np.zeros((0, 4))
+        self._trail: list[np.ndarray] = []
         self._touched: list[np.ndarray] = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
 
@@ -339,6 +349,13 @@ class ExplorationMap:
             if v < 0:
                 self._place(int(i))
         self._update_sources()
+        if came is not None:
+            self._trail.append(came)
+        if len(c) and not np.isfinite(c.path_length).any() and self._trail:
+            g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
+            self._trail = []
+            self._update_sources()
+            local[:] = True
         lost = np.flatnonzero(local & ~np.isfinite(c.path_length))
         if len(lost):
             seen = g.reachable(self.robot)

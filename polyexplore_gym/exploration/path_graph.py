@@ -37,6 +37,8 @@ _FLAT = 0.2
 """A corner that turns less than this (rad) beyond straight gets no vertex."""
 _ARC = math.pi / 4
 """A path turns round a corner in steps of at most this angle, rad."""
+_TRAIL = 8.0
+"""The same, for a place where the robot has driven: no wall refutes that."""
 _WAY_POINT = 4.0
 """Where no corner stands within this distance (m) of a scan, the scan's place becomes a vertex itself."""
 _LEEWAY = 0.12
@@ -51,8 +53,8 @@ _ANY = 4.0
 def _free_sector(ex, ey, walls, start, items):
     """The widest free sector around a wall end: the directions (from, to) of the walls that bound it.
 
-    Walls are judged where they cross a small circle; returns (a, b, width) with b = a + width, and
-    width 2 pi if nothing crosses it.
+    Walls are judged where they cross a small circle; returns (a, b, width) with b = a + width. One
+    wall leaves 2 pi; where nothing crosses the circle, width is 4 pi: the obstacle is small.
     """
     mask = start.size - 2
     h = _NEIGHBOURHOOD
@@ -83,7 +85,7 @@ def _free_sector(ex, ey, walls, start, items):
                 angles[n] = math.atan2(y1 + t * dy, x1 + t * dx)
                 n += 1
     if n == 0:
-        return 0.0, 2.0 * math.pi, 2.0 * math.pi
+        return 0.0, 0.0, 4.0 * math.pi
     found = np.sort(angles[:n])
     best = found[0] + 2.0 * math.pi - found[n - 1]
     a = found[n - 1]
@@ -110,13 +112,13 @@ def corner_vertices(ends, walls, start, items, rho, need):
         ex = ends[q, 0]
         ey = ends[q, 1]
         a, b, gap = _free_sector(ex, ey, walls, start, items)
-        lone = gap >= 2.0 * math.pi
-        turn = gap if lone else gap - math.pi
+        lone = gap > 3.0 * math.pi
+        turn = 2.0 * math.pi if lone else gap - math.pi
         if turn < _FLAT:
             continue
         parts = int(math.ceil(turn / _ARC - 1e-9))
         first = a if lone else a + 0.5 * math.pi
-        last_kept = True
+        last_plain = True
         for p in range(parts):
             if count == out.shape[0]:
                 break
@@ -141,22 +143,23 @@ def corner_vertices(ends, walls, start, items, rho, need):
                         y = ey + d * uy
                 limit = _FREE
                 kept = low >= 0.0
-            if not kept:
                 # The neighbour on the polyline takes over its directions.
-                if last_kept and p > 0:
+                if last_plain and p > 0:
                     shape[count - 1, 6] = _FREE
-                last_kept = False
+            if not kept:
+                last_plain = False
                 continue
             out[count, 0] = x
             out[count, 1] = y
             shape[count, 0] = ex
             shape[count, 1] = ey
-            shape[count, 2] = math.cos(a)
-            shape[count, 3] = math.sin(a)
-            shape[count, 4] = math.cos(b)
-            shape[count, 5] = math.sin(b)
-            shape[count, 6] = limit if last_kept else _FREE
-            last_kept = True
+            # A small obstacle has no walls beside which a path could not be taut.
+            shape[count, 2] = 0.0 if lone else math.cos(a)
+            shape[count, 3] = 0.0 if lone else math.sin(a)
+            shape[count, 4] = 0.0 if lone else math.cos(b)
+            shape[count, 5] = 0.0 if lone else math.sin(b)
+            shape[count, 6] = limit if last_plain else _FREE
+            last_plain = limit < _FREE
             count += 1
     return out[:count].copy(), shape[:count].copy()
 
@@ -188,10 +191,13 @@ def retire(position, kind, shape, n_vertices, touched, walls, start, items, need
         if not near:
             continue
         a, b, gap = _free_sector(ex, ey, walls, start, items)
-        same = (
-            shape[v, 2] * math.cos(a) + shape[v, 3] * math.sin(a) > 0.99
-            and shape[v, 4] * math.cos(b) + shape[v, 5] * math.sin(b) > 0.99
-        )
+        if gap > 3.0 * math.pi:
+            same = shape[v, 2] == 0.0 and shape[v, 3] == 0.0
+        else:
+            same = (
+                shape[v, 2] * math.cos(a) + shape[v, 3] * math.sin(a) > 0.99
+                and shape[v, 4] * math.cos(b) + shape[v, 5] * math.sin(b) > 0.99
+            )
         if same and clearance(position[v, 0], position[v, 1], walls, start, items, REACH) >= need - 0.005:
             continue
         # The vertices of one wall end serve together: judge it anew as a whole.
@@ -205,41 +211,46 @@ def retire(position, kind, shape, n_vertices, touched, walls, start, items, need
 
 
 @njit(cache=True)
-def distinct(candidates, forms, position, shape, kind, n_vertices):
-    """Which candidates (m, 2) with `forms` (m, 7) add to the living corner vertices and to earlier candidates.
+def _absorb(x, y, form, px, py, shape):
+    """Whether the vertex at (px, py) with `shape` can stand for a candidate at (x, y) with `form`; if so, widen it.
 
-    One that stands beside another of the same corner and looks the same way adds nothing; the other
-    then serves a wider range of directions.
+    Both must stand beside each other and look the same way from their corners.
     """
+    if math.hypot(px - x, py - y) > _SPACING:
+        return False
+    rx = x - form[0]
+    ry = y - form[1]
+    qx = px - shape[0]
+    qy = py - shape[1]
+    if rx * qx + ry * qy <= 0.9 * math.hypot(rx, ry) * math.hypot(qx, qy):
+        return False
+    for k in (2, 4):
+        if form[k] * shape[k] + form[k + 1] * shape[k + 1] < 0.95:
+            # Their corners differ: what is taut past one need not be past the other.
+            shape[k] = 0.0
+            shape[k + 1] = 0.0
+            shape[6] = _FREE
+    shape[6] = max(shape[6], form[6])
+    return True
+
+
+@njit(cache=True)
+def distinct(candidates, forms, position, shape, kind, n_vertices):
+    """Which candidates (m, 2) with `forms` (m, 7) no living corner vertex, or earlier candidate, can stand for."""
     m = candidates.shape[0]
     keep = np.ones(m, np.bool_)
     for i in range(m):
         x = candidates[i, 0]
         y = candidates[i, 1]
-        rx = x - forms[i, 0]
-        ry = y - forms[i, 1]
-        r = math.hypot(rx, ry)
         for v in range(n_vertices):
             if kind[v] != CORNER or abs(position[v, 0] - x) > _SPACING or abs(position[v, 1] - y) > _SPACING:
                 continue
-            if math.hypot(position[v, 0] - x, position[v, 1] - y) > _SPACING:
-                continue
-            qx = position[v, 0] - shape[v, 0]
-            qy = position[v, 1] - shape[v, 1]
-            if rx * qx + ry * qy > 0.9 * r * math.hypot(qx, qy):
+            if _absorb(x, y, forms[i], position[v, 0], position[v, 1], shape[v]):
                 keep[i] = False
-                shape[v, 6] = max(shape[v, 6], forms[i, 6] + _LEEWAY)
                 break
         for j in range(i):
-            if not (keep[i] and keep[j]):
-                continue
-            if math.hypot(candidates[j, 0] - x, candidates[j, 1] - y) > _SPACING:
-                continue
-            qx = candidates[j, 0] - forms[j, 0]
-            qy = candidates[j, 1] - forms[j, 1]
-            if rx * qx + ry * qy > 0.9 * r * math.hypot(qx, qy):
+            if keep[i] and keep[j] and _absorb(x, y, forms[i], candidates[j, 0], candidates[j, 1], forms[j]):
                 keep[i] = False
-                forms[j, 6] = max(forms[j, 6], forms[i, 6] + _LEEWAY)
     return keep
 
 
@@ -360,10 +371,10 @@ def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shap
     for v in range(n_vertices):
         x = position[v, 0]
         y = position[v, 1]
-        if kind[v] != CORNER or x < x0 or x > x1 or y < y0 or y > y1:
+        if kind[v] != CORNER or shape[v, 6] >= _TRAIL or x < x0 or x > x1 or y < y0 or y > y1:
             continue
         for w in range(walls.shape[0]):
-            if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.005:
+            if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.008:
                 kind[v] = -1
                 break
     for e in range(n_edges):
@@ -394,7 +405,7 @@ def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shap
                 # A wall refitted a few millimetres nearer does not cut the edge: it would flicker.
                 if (
                     segment_distance(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
-                    < wants[e] - 0.005
+                    < wants[e] - 0.002
                 ):
                     dead = True
                     break
@@ -631,10 +642,12 @@ class PathGraph:
     """Owner of the graph. Positions in the map frame, lengths in metres."""
 
     def __init__(self, radius: float, spare: float, tolerance: float) -> None:
-        """`radius` of the disc; corners are passed at radius + `spare`, and nothing nearer than radius + `tolerance`."""
+        """For a disc of `radius`: corners are passed at radius + `spare`, way points keep radius + `tolerance` to all
+        walls, and the straight legs between them a fifth of the tolerance (a leg cuts the arc round a corner)."""
         self.radius = radius
         self.rho = radius + spare
         self.need = radius + tolerance
+        self.sweep = radius + 0.2 * tolerance
         self.n_vertices = 0
         self.position = np.zeros((256, 2))
         self.shape = np.zeros((256, 7))
@@ -771,13 +784,26 @@ class PathGraph:
         self.dist = np.concatenate((self.dist, np.full((k, extra), math.inf)), axis=1)
         self.parent = np.concatenate((self.parent, np.full((k, extra), -1, np.int64)), axis=1)
 
+    def add_trail(self, points: np.ndarray, robot: int) -> None:
+        """Make the way driven (k, 2) part of the graph, up to the robot: it led here, so it leads back."""
+        shape = np.tile([1e9, 0.0, 1.0, 0.0, 1.0, 0.0, _TRAIL], (len(points), 1))
+        ids = self._new_vertices(points, shape)
+        self._connect(ids, 0.0)
+        chain = np.append(ids, robot)
+        pairs = np.stack((chain[:-1], chain[1:]), axis=1)
+        length = np.hypot(*(self.position[pairs[:, 0]] - self.position[pairs[:, 1]]).T)
+        self._add_edges(pairs, length, np.full(len(pairs), OPEN, np.int8), np.zeros(len(pairs)))
+
     def _connect(self, fresh: np.ndarray, slack: float) -> None:
         if not len(fresh):
             return
         pairs, length, state, wants = connect(
             fresh, self.position, self.shape, self.kind, self.n_vertices, self.walls, *self.wall_grid,
-            self.pieces, *self.piece_grid, self.piece_owner, self.owner, self.need, self.relaxed, slack,
+            self.pieces, *self.piece_grid, self.piece_owner, self.owner, self.sweep, self.relaxed, slack,
         )  # fmt: skip
+        self._add_edges(pairs, length, state, wants)
+
+    def _add_edges(self, pairs: np.ndarray, length: np.ndarray, state: np.ndarray, wants: np.ndarray) -> None:
         m = len(pairs)
         first = self.n_edges
         if first + m > len(self.state):
