@@ -38,7 +38,7 @@ class ScanLines:
     fragments: np.ndarray
     """(F, 4) short pieces joining neighbouring leftover returns, m: obstacles without a trusted covariance."""
     smoothed: np.ndarray
-    """(n,) ranges with each return on a line put where its nominal beam meets the line, m (not above 80 degrees)."""
+    """(n,) ranges, m, inf without a return; on a line, where the nominal beam meets it (raw above 80 degrees)."""
 
 
 def extract_lines(

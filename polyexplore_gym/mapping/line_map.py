@@ -7,7 +7,8 @@ import numpy as np
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping.extract import LEAST_ANGLE_NOISE, LEAST_RANGE_NOISE, ScanLines
 from polyexplore_gym.mapping.grid import empty_grid, grid_put
-from polyexplore_gym.mapping.merge import Lines, Rows, Slots, insert
+from polyexplore_gym.mapping.merge import insert
+from polyexplore_gym.mapping.slots import Lines, Rows, Slots
 
 
 class LineMap:

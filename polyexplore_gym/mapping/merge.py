@@ -1,138 +1,32 @@
-"""Kernels of the line map: association, fusion, intervals of wall on a line, fragments."""
+"""Merging a scan into the line map: association, fusion, intervals of wall on a line, fragments."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
-from polyexplore_gym.mapping.grid import Grid, grid_put, grid_query, grid_remove
+from polyexplore_gym.mapping.grid import Grid, grid_query
+from polyexplore_gym.mapping.slots import (
+    Lines,
+    Rows,
+    Slots,
+    free_line,
+    free_row,
+    new_row,
+    oriented,
+    publish,
+    store,
+    unlink,
+)
 
 MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
 SAME_SIDE = 1.7  # rad; a segment facing farther away than this does not stand for another
-STILL = 2e-3  # m; a row whose ends move less counts as untouched
 COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
 LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end along its line
-
-
-class Rows(NamedTuple):
-    """Segments in slots, one entry a row."""
-
-    segments: np.ndarray
-    """(M, 4) as published: end points, free space seen on the left."""
-    ends: np.ndarray
-    """(M, 4) the same to the last bit; `segments` follows in steps of 2 mm or more."""
-    end_variance: np.ndarray
-    """(M, 2) variance of each end along the line, m2."""
-    alive: np.ndarray
-    line: np.ndarray
-    """(M,) line slot, -1 for a fragment."""
-    side: np.ndarray
-    """(M,) 1: seen from the side of the map's origin, -1: from beyond the line; 0 for a fragment."""
-    sigma: np.ndarray
-    """(M,) standard deviation across the segment, m."""
-    next: np.ndarray
-    """(M,) next row on the same line, -1 at the end."""
-    touched: np.ndarray
-    """(M,) number of the insert that touched the row last."""
-
-
-class Lines(NamedTuple):
-    """Lines in slots."""
-
-    rho: np.ndarray
-    alpha: np.ndarray
-    covariance: np.ndarray
-    alive: np.ndarray
-    side: np.ndarray
-    first: np.ndarray
-    """First row on the line, -1 for none."""
-
-
-class Slots(NamedTuple):
-    """Free slots, used last in first out, and counters."""
-
-    rows: np.ndarray
-    lines: np.ndarray
-    counts: np.ndarray
-    """Number of free rows, free lines, inserts so far, touched rows of this insert."""
-    touched: np.ndarray
-    """Rows touched in this insert."""
-    found: np.ndarray
-    """Scratch for the answers of the spatial index."""
-
-
-@njit(cache=True)
-def oriented(lines: Lines, i: int) -> tuple[float, float, np.ndarray]:
-    """The line with its normal pointing away from where it was seen (rho may be negative)."""
-    p = lines.covariance[i]
-    if lines.side[i] > 0:
-        return lines.rho[i], lines.alpha[i], p
-    q = p.copy()
-    q[0, 1], q[1, 0] = -p[0, 1], -p[1, 0]
-    return -lines.rho[i], wrap(lines.alpha[i] + math.pi), q
-
-
-@njit(cache=True)
-def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray) -> None:
-    """Write an oriented line into its slot with rho >= 0 and the side it was seen from."""
-    lines.covariance[i, 0, 0], lines.covariance[i, 1, 1] = p[0, 0], p[1, 1]
-    if rho < 0.0:
-        lines.rho[i], lines.alpha[i], lines.side[i] = -rho, wrap(alpha + math.pi), -1
-        lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = -p[0, 1]
-    else:
-        lines.rho[i], lines.alpha[i], lines.side[i] = rho, wrap(alpha), 1
-        lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = p[0, 1]
-
-
-@njit(cache=True)
-def touch(rows: Rows, slots: Slots, row: int) -> None:
-    if rows.touched[row] != slots.counts[2]:
-        rows.touched[row] = slots.counts[2]
-        slots.touched[slots.counts[3]] = row
-        slots.counts[3] += 1
-
-
-@njit(cache=True)
-def new_row(rows: Rows, slots: Slots) -> int:
-    slots.counts[0] -= 1
-    row = slots.rows[slots.counts[0]]
-    rows.alive[row] = True
-    rows.segments[row] = math.inf
-    return row
-
-
-@njit(cache=True)
-def free_row(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
-    rows.alive[row] = False
-    rows.line[row] = -1
-    rows.side[row] = 0
-    slots.rows[slots.counts[0]] = row
-    slots.counts[0] += 1
-    grid_remove(grid, row)
-    touch(rows, slots, row)
-
-
-@njit(cache=True)
-def free_line(lines: Lines, slots: Slots, line: int) -> None:
-    lines.alive[line] = False
-    slots.lines[slots.counts[1]] = line
-    slots.counts[1] += 1
-
-
-@njit(cache=True)
-def publish(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
-    """Bring the published segment up to date if an end moved by 2 mm or more."""
-    e, s = rows.ends[row], rows.segments[row]
-    still = math.hypot(e[0] - s[0], e[1] - s[1]) < STILL and math.hypot(e[2] - s[2], e[3] - s[3]) < STILL
-    if not still:
-        rows.segments[row] = e
-        grid_put(grid, row, e[0], e[1], e[2], e[3])
-        touch(rows, slots, row)
 
 
 @njit(cache=True)
@@ -322,21 +216,6 @@ def lay(
         rows.end_variance[row, 0], rows.end_variance[row, 1] = span[q, 2], span[q, 3]
         rows.sigma[row] = across(alpha, p, e)
         publish(rows, grid, slots, row)
-
-
-@njit(cache=True)
-def unlink(rows: Rows, lines: Lines, slots: Slots, row: int) -> None:
-    """Take a row off its line; a line without rows is freed."""
-    line = rows.line[row]
-    at = lines.first[line]
-    if at == row:
-        lines.first[line] = rows.next[row]
-    else:
-        while rows.next[at] != row:
-            at = rows.next[at]
-        rows.next[at] = rows.next[row]
-    if lines.first[line] < 0:
-        free_line(lines, slots, line)
 
 
 @njit(cache=True)

@@ -11,7 +11,8 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
 from polyexplore_gym.mapping.fit import to_map, wrap
 from polyexplore_gym.mapping.grid import empty_grid, grid_put, grid_query, grid_remove
-from polyexplore_gym.mapping.merge import candidates, oriented
+from polyexplore_gym.mapping.merge import candidates
+from polyexplore_gym.mapping.slots import oriented
 
 SENSOR = SensorConfig()
 FIVE = SensorConfig(sigma_range=0.05, sigma_angle=math.radians(0.5))
