@@ -107,6 +107,10 @@ class EpisodeRecord:
                 values[f.name] = _checked(f.name, values[f.name], *kind)
         if values["status"] not in STATUSES:
             raise ValueError(f"status is {values['status']!r}, not one of {', '.join(STATUSES)}")
+        if len(values["curve_distance"]) != len(values["curve_coverage"]):
+            raise ValueError("curve_distance and curve_coverage differ in length")
+        if values["status"] == "complete" and not values["curve_distance"]:
+            raise ValueError("curve_distance is empty though the episode is complete")
         return cls(**values)
 
 

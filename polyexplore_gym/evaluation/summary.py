@@ -309,7 +309,7 @@ def _notes(
         notes.append(f"{placement}: left out of the comparison, as nothing was completed: {', '.join(left_out)}")
     errors = [r for r in here if r.status == "failed"]
     for r in errors[:3]:
-        notes.append(f"{placement}: {r.policy} failed on {r.plan} (seed {r.seed}): {(r.error or '').splitlines()[0]}")
+        notes.append(f"{placement}: {r.policy} failed on {r.plan} (seed {r.seed}): {(r.error or '?').splitlines()[0]}")
     if len(errors) > 3:
         notes.append(f"{placement}: {len(errors) - 3} more failed; see the field `error` of the records")
     short = sum(r.complete for r in here) - sum(r.placement == placement for r in completed(records))

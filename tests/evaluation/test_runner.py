@@ -162,10 +162,13 @@ def test_a_damaged_middle_line_stops_with_its_number(tmp_path):
             with pytest.raises(ResultsError, match=rf"{EPISODES}:3: damaged line"):
                 read()
     value = json.loads(lines[2])
-    for field, wrong in (("status", "odd"), ("distance", "far"), ("seed", 1.5), ("policy", None), ("coverage", None)):
+    wrongs = [("status", "odd"), ("distance", "far"), ("seed", 1.5), ("policy", None), ("coverage", None)]
+    wrongs += [("curve_distance", [0.0]), ("curve_distance", 3), ("curve_coverage", ["x"])]
+    for field, wrong in wrongs:
         path.write_bytes(b"".join([*lines[:2], json.dumps({**value, field: wrong}).encode() + b"\n", *lines[3:]]))
-        with pytest.raises(ResultsError, match=rf"{EPISODES}:3: .*{field}"):
+        with pytest.raises(ResultsError, match=rf"{EPISODES}:3: damaged") as caught:
             run(study(), tmp_path)
+        assert field in str(caught.value) or wrong == 3
 
 
 def test_a_folder_of_another_study_is_refused(tmp_path):
