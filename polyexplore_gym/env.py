@@ -13,9 +13,10 @@ from gymnasium import spaces
 
 from polyexplore_gym import observation
 from polyexplore_gym.config import EnvConfig, from_mapping
-from polyexplore_gym.errors import InvalidActionError, InvalidConfigError
+from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
 from polyexplore_gym.exploration import ExplorationMap
-from polyexplore_gym.floorplan import FloorPlan, load_plan
+from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
+from polyexplore_gym.floorplan import suite as suite_named
 from polyexplore_gym.mapping import LineMap, extract_lines
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
@@ -24,6 +25,10 @@ from polyexplore_gym.sim.pose import PoseModel
 from polyexplore_gym.sim.world import World
 from polyexplore_gym.snapshot import Snapshot
 
+WINDOW_FPS = 10.0
+"""The window shows at most so many pictures a second."""
+WINDOW_STEP = 0.5
+"""Way between two pictures of a drive in the window, m."""
 COVERAGE_GRID = 0.2
 """Spacing of the sample points behind `info["coverage"]`, m."""
 
@@ -35,6 +40,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     observation and `info` say which are valid; a masked one does nothing and is penalised, one out
     of range raises. Reward: minus the metres driven by default (`RewardConfig`). The episode
     terminates when no reachable jump edge is left and is truncated after `EnvConfig.max_decisions`.
+    A plan seen whole from the start terminates in the first step, whatever the action, at no cost.
 
     Version history: v0, the first.
     """
@@ -57,12 +63,17 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             render_mode: "rgb_array", "human" or None.
 
         Raises:
-            InvalidConfigError: a field of the configuration is unknown or out of range.
+            InvalidConfigError: a field of the configuration is unknown or out of range, no such suite, or
+                a plan and a suite.
             InvalidFloorPlanError: the plan cannot be read or is invalid.
         """
+        if plan is not None and suite is not None:
+            raise InvalidConfigError(f"a plan and the suite {suite!r}: give one (PolyExplore-Plan-v0 takes a plan)")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidConfigError(f"render_mode {render_mode!r}: must be None, 'rgb_array' or 'human'")
-        self.config = config if isinstance(config, EnvConfig) else from_mapping(EnvConfig, config or {})
+        self.config = (
+            config if isinstance(config, EnvConfig) else from_mapping(EnvConfig, {} if config is None else config)
+        )
         self.render_mode = render_mode
         self._suite = None if suite is None else _suite(suite)
         self._plan = None if plan is None else self._checked(plan)
@@ -83,7 +94,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             options: "plan": a `FloorPlan` or a path; "start": (x, y, heading) in metres and radians.
 
         Raises:
-            InvalidFloorPlanError: the plan or the start is unusable, or none was given.
+            InvalidFloorPlanError: the plan or the start is unusable.
+            InvalidConfigError: an unknown option, or no plan was given anywhere.
         """
         super().reset(seed=seed)
         plan_rng, start_rng, self._laser_rng, pose_rng = self.np_random.spawn(4)
@@ -112,18 +124,18 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
         self._distance = self._sim_time = 0.0
-        self._path = pose[None, :2].copy()
-        self._trajectory = [pose[None]]
+        self._completed = False
+        self._trajectory = [self._world.pose[None]]
         self._measured_at: list[np.ndarray] = []
-        self._chosen: int | None = None
         self._felt: float | None = None
         self._look_around()
+        self._path = self._pose_model.estimate[None, :2]
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
         self._observe()
         info = self._info(StepOutcome(), invalid=False)
         if self.render_mode == "human":
             self.render()
-        return self._observed.arrays, info
+        return self._observation(), info
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Drive to node `action`, measure there, and observe.
@@ -134,31 +146,37 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         if self._world is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         node = self._checked_action(action)
+        scene = self.snapshot() if self.render_mode == "human" else None
         self._decisions += 1
         before = (self._distance, self._coverage.share, self._measurements, self._collisions)
+        choice = self._observed.arrays["action_mask"].any()
         valid = bool(self._observed.arrays["action_mask"][node])
         if valid:
             self._go(int(self._observed.rows[node]))
             self._observe()
-        self._chosen = node if valid else None
+        else:
+            self._path = self._pose_model.estimate[None, :2]
         terminated = not self._observed.arrays["action_mask"].any()
         outcome = StepOutcome(
             distance=self._distance - before[0],
             coverage=self._coverage.share - before[1],
             measurement=self._measurements - before[2],
             collision=self._collisions - before[3],
-            completion=float(terminated),
-            invalid_action=float(not valid),
+            completion=float(terminated and not self._completed),
+            invalid_action=float(choice and not valid),
         )
+        self._completed = terminated
         info = self._info(outcome, invalid=not valid)
         reward = float(sum(info["rewards"].values()))
         truncated = not terminated and self._decisions >= self.config.max_decisions
-        if self.render_mode == "human":
-            self.render()
-        return self._observed.arrays, reward, terminated, truncated, info
+        if scene is not None:
+            self._show_motion(scene, node if valid else None)
+        return self._observation(), reward, terminated, truncated, info
 
     def action_masks(self) -> np.ndarray:
         """(max_nodes,) bool: which actions are valid (the name that sb3-contrib's MaskablePPO looks for)."""
+        if self._world is None:
+            raise gymnasium.error.ResetNeeded("call reset() before action_masks()")
         return self._observed.arrays["action_mask"].astype(bool)
 
     def render(self) -> np.ndarray | None:
@@ -171,9 +189,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         picture = rendering.frame(self.snapshot())
         if self.render_mode == "rgb_array":
             return picture
-        if self._window is None:
-            self._window = rendering.Window(f"polyexplore_gym: {self.plan.name}", self.metadata["render_fps"])
-        self._window.show(picture)
+        self._show(picture)
         return None
 
     def close(self) -> None:
@@ -181,6 +197,23 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         if self._window is not None:
             self._window.close()
             self._window = None
+
+    def _show(self, picture: np.ndarray) -> bool:
+        """Show a picture in the window; False once the user has closed it."""
+        from polyexplore_gym import rendering
+
+        if self._window is None:
+            self._window = rendering.Window("polyexplore_gym", WINDOW_FPS)
+        return bool(self._window.show(picture))
+
+    def _show_motion(self, before: Snapshot, chosen: int | None) -> None:
+        """Show a step as it happened: the choice, the drive, and what is known after it."""
+        from polyexplore_gym import rendering
+
+        after = self.snapshot()
+        for scene in (*rendering.motion(before, after, chosen, WINDOW_STEP), after):
+            if not self._show(rendering.frame(scene)):
+                break
 
     # What happens in a step -------------------------------------------------------------------
 
@@ -220,16 +253,12 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """Drive; scans on the way are taken without stopping. Whether the end was reached."""
         assert self._world is not None
         result = self._world.drive(path, heading)
-        way = result.trajectory
-        every = self.config.exploration.scan_every
+        way, stops = _with_stops(result.trajectory, self.config.exploration.scan_every)
         done = 0
-        if every > 0:
-            driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))))
-            for mark in np.arange(every, driven[-1] - 0.5 * every, every):
-                stop = int(np.searchsorted(driven, mark))
-                self._pose_model.moved(way[done : stop + 1])
-                self._measure(way[stop], None, arrived=True)
-                done = stop
+        for stop in stops:
+            self._pose_model.moved(way[done : stop + 1])
+            self._measure(way[stop], None, arrived=True)
+            done = stop
         self._pose_model.moved(way[done:])
         self._trajectory.append(way)
         self._distance += result.distance
@@ -272,6 +301,10 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             self.config.observation,
         )
 
+    def _observation(self) -> dict[str, np.ndarray]:
+        """The observation, the caller's own to change."""
+        return {key: value.copy() for key, value in self._observed.arrays.items()}
+
     def _info(self, outcome: StepOutcome, *, invalid: bool) -> dict[str, Any]:
         return {
             "action_mask": self._observed.arrays["action_mask"].copy(),
@@ -280,7 +313,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             "measurements": self._measurements,
             "sim_time": self._sim_time,
             "collisions": self._collisions,
-            "path": self._path,
+            # No array: Gymnasium's vector environments stack arrays, and the paths differ in length.
+            "path": tuple(map(tuple, self._path.tolist())),
             "rewards": rewards(outcome, self.config.reward),
             "invalid_action": invalid,
             "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
@@ -296,6 +330,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         return int(action)
 
     def _checked(self, plan: FloorPlan | str | Path) -> FloorPlan:
+        if not isinstance(plan, (FloorPlan, str, Path)):
+            raise InvalidFloorPlanError(f"plan: expected a FloorPlan or a path, got {type(plan).__name__}")
         plan = plan if isinstance(plan, FloorPlan) else load_plan(plan)
         plan.check_connected(self.config.robot.radius)
         return plan
@@ -351,7 +387,20 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         )
 
 
-def _suite(name: str) -> Any:
-    from polyexplore_gym.floorplan import suite
+def _suite(name: str) -> Suite:
+    if name not in list_suites():
+        raise InvalidConfigError(f"unknown suite {name!r}; known: {', '.join(list_suites())}")
+    return suite_named(name)
 
-    return suite(name)
+
+def _with_stops(way: np.ndarray, every: float) -> tuple[np.ndarray, list[int]]:
+    """A trajectory (m, 3) with a pose at every so many metres put in, and the rows of those; none near the end."""
+    driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))))
+    marks = np.arange(every, driven[-1] - 0.5 * every, every) if every > 0 else np.zeros(0)
+    if not len(marks):
+        return way, []
+    nxt = np.searchsorted(driven, marks)
+    share = ((marks - driven[nxt - 1]) / (driven[nxt] - driven[nxt - 1]))[:, None]
+    step = way[nxt] - way[nxt - 1]
+    step[:, 2] = np.remainder(step[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+    return np.insert(way, nxt, way[nxt - 1] + share * step, axis=0), (nxt + np.arange(len(marks))).tolist()

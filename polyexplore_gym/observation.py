@@ -84,8 +84,8 @@ def observe(
     frame = pose if config.relative else np.zeros(3)
     arrays = {
         "pose": pose.astype(np.float32),
-        "pose_covariance": covariance.astype(np.float32),
-        "max_range": np.array([max_range], np.float32),
+        "pose_covariance": np.clip(covariance, -_VARIANCE, _VARIANCE).astype(np.float32),
+        "max_range": np.array([min(max_range, LIMIT)], np.float32),
         "edges": _padded(_seen_from(c.ends[rows].reshape(-1, 2), frame).reshape(-1, 4), n, 4),
         "node_position": _padded(_seen_from(c.node[rows, :2], frame), n, 2),
         "node_heading": _padded(_wrapped(c.node[rows, 2] - frame[2]), n),
@@ -107,15 +107,15 @@ def observe(
 
 
 def _lines(lines: LineMap, pose: np.ndarray, frame: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """The segments nearest to the robot: end points, rho, alpha and their covariance; zero for fragments."""
+    """The segments nearest to the robot: end points, rho, alpha and their covariance (zero for fragments).
+
+    Which of them, and how many were cut.
+    """
     rows = np.flatnonzero(lines.alive)
     cut = max(len(rows) - m, 0)
     segments = lines.segments[rows]
     if cut:
-        far = np.hypot(
-            0.5 * (segments[:, 0] + segments[:, 2]) - pose[0], 0.5 * (segments[:, 1] + segments[:, 3]) - pose[1]
-        )
-        keep = np.sort(np.argpartition(far, m)[:m])
+        keep = np.sort(np.argsort(_distance(segments, pose), kind="stable")[:m])
         rows, segments = rows[keep], segments[keep]
     k = len(rows)
     out = np.zeros((m, 9), np.float32)
@@ -139,9 +139,7 @@ def _lines(lines: LineMap, pose: np.ndarray, frame: np.ndarray, m: int) -> tuple
         par = np.where(flip, -par, par)
     out[fitted, 4] = rho
     out[fitted, 5] = alpha
-    out[fitted, 6] = paa
-    out[fitted, 7] = par
-    out[fitted, 8] = prr
+    out[fitted, 6:] = np.clip(np.stack((paa, par, prr), axis=1), -_VARIANCE, _VARIANCE)
     return out, mask, cut
 
 
@@ -158,6 +156,13 @@ def _seen_from(points: np.ndarray, frame: np.ndarray) -> np.ndarray:
     c, s = math.cos(frame[2]), math.sin(frame[2])
     x, y = points[:, 0] - frame[0], points[:, 1] - frame[1]
     return np.stack((c * x + s * y, c * y - s * x), axis=1)
+
+
+def _distance(segments: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Distance (k,) of segments (k, 4) from the position of a pose."""
+    a, d = segments[:, :2] - pose[:2], segments[:, 2:] - segments[:, :2]
+    along = np.clip(-(a * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-12), 0.0, 1.0)
+    return np.hypot(*(a + along[:, None] * d).T)
 
 
 def _wrapped(angles: np.ndarray) -> np.ndarray:

@@ -28,4 +28,4 @@ class StepOutcome:
 
 def rewards(outcome: StepOutcome, scales: RewardConfig) -> dict[str, float]:
     """Each term of the reward, scaled; the reward is their sum."""
-    return {f.name: getattr(scales, f.name) * getattr(outcome, f.name) for f in dataclasses.fields(StepOutcome)}
+    return {f.name: float(getattr(scales, f.name) * getattr(outcome, f.name)) for f in dataclasses.fields(StepOutcome)}
