@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.exploration.scan_polygon import inside_intervals, subtract
+from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, subtract
 from polyexplore_gym.exploration.segments import point_segment_distance
 
 _MAX_INTERVALS = 64
@@ -198,22 +198,121 @@ def clip_known(pieces, known, margin, shortest):
 
 
 @njit(cache=True)
-def touching_chains(pieces, chain, dirty, tolerance):
-    """Chains (ids) of clean pieces with an end near an end of a dirty piece that it could join."""
+def _wake_touching(pieces, owner, stale, tolerance):
+    """Make stale every whole chain with an end near an end of a stale piece that it could join."""
     n = pieces.shape[0]
-    hit = np.zeros(n, np.bool_)
-    for i in range(n):
-        if dirty[i] or chain[i] < 0:
-            continue
-        for j in range(n):
-            if not dirty[j]:
-                continue
+    woken = True
+    while woken:
+        woken = False
+        x0 = y0 = math.inf
+        x1 = y1 = -math.inf
+        for i in range(n):
+            if stale[i]:
+                x0 = min(x0, pieces[i, 0], pieces[i, 2])
+                x1 = max(x1, pieces[i, 0], pieces[i, 2])
+                y0 = min(y0, pieces[i, 1], pieces[i, 3])
+                y1 = max(y1, pieces[i, 1], pieces[i, 3])
+        for i in range(n):
             if (
-                abs(pieces[i, 0] - pieces[j, 2]) <= tolerance and abs(pieces[i, 1] - pieces[j, 3]) <= tolerance
-            ) or (abs(pieces[i, 2] - pieces[j, 0]) <= tolerance and abs(pieces[i, 3] - pieces[j, 1]) <= tolerance):
-                hit[i] = True
-                break
-    return hit
+                stale[i]
+                or owner[i] < 0
+                or min(pieces[i, 0], pieces[i, 2]) > x1 + tolerance
+                or max(pieces[i, 0], pieces[i, 2]) < x0 - tolerance
+                or min(pieces[i, 1], pieces[i, 3]) > y1 + tolerance
+                or max(pieces[i, 1], pieces[i, 3]) < y0 - tolerance
+            ):
+                continue
+            for j in range(n):
+                if not stale[j]:
+                    continue
+                if (
+                    abs(pieces[i, 0] - pieces[j, 2]) <= tolerance and abs(pieces[i, 1] - pieces[j, 3]) <= tolerance
+                ) or (abs(pieces[i, 2] - pieces[j, 0]) <= tolerance and abs(pieces[i, 3] - pieces[j, 1]) <= tolerance):
+                    chain = owner[i]
+                    for q in range(n):
+                        if owner[q] == chain:
+                            stale[q] = True
+                    woken = True
+                    break
+
+
+@njit(cache=True)
+def rechain(pieces, kinds, visits, done, owner, dirty, local, kept, origin, fresh, fresh_kinds, seen_from, max_visits,
+            tolerance, shortest, longest, next_id):  # fmt: skip
+    """Replace the `local` pieces by what is left of them, add the `fresh` ones, chain what changed anew.
+
+    `dirty` (m,) marks pieces that changed, `kept` (k, 4) is left of `local` by `origin`; `seen_from`
+    (k,) marks those of `kept` that the scan looked at without finding more: they are done.
+    Returns the new pieces, kinds, visits, done and owner arrays (the pieces of a chain together and
+    in order), and the new chains: ids, summary (see `summarise`), ends, kinds, visits.
+    """
+    m = pieces.shape[0]
+    away = np.ones(m, np.bool_)
+    for i in local:
+        away[i] = False
+    n_rest = int(away.sum())
+    n = n_rest + kept.shape[0] + fresh.shape[0]
+    p = np.empty((n, 4))
+    kind = np.empty(n, np.int8)
+    visit = np.zeros(n, np.int64)
+    finished = np.zeros(n, np.bool_)
+    own = np.full(n, -1, np.int64)
+    stale = np.ones(n, np.bool_)
+    lost = np.zeros(next_id + 1, np.bool_)
+    for i in range(m):
+        if dirty[i] and owner[i] >= 0:
+            lost[owner[i]] = True
+    at = 0
+    for i in range(m):
+        if away[i]:
+            p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
+                pieces[i], kinds[i], visits[i], done[i], owner[i], dirty[i],
+            )  # fmt: skip
+            at += 1
+    for k in range(kept.shape[0]):
+        i = local[origin[k]]
+        p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
+            kept[k], kinds[i], visits[i], done[i] or seen_from[k], owner[i], dirty[i],
+        )  # fmt: skip
+        at += 1
+    for k in range(fresh.shape[0]):
+        p[at] = fresh[k]
+        kind[at] = fresh_kinds[k]
+        at += 1
+    for i in range(n):
+        finished[i] |= visit[i] >= max_visits
+        if own[i] >= 0 and lost[own[i]]:
+            stale[i] = True
+        if finished[i]:
+            own[i] = -1
+            stale[i] = False
+    _wake_touching(p, own, stale, tolerance)
+    rows = np.flatnonzero(stale)
+    order, offsets = link(p[rows], tolerance, shortest, longest)
+    data, ends, chain_kind, chain_visits = summarise(p[rows], kind[rows], visit[rows], order, offsets)
+    ids = np.arange(next_id, next_id + chain_kind.size)
+    for q in range(ids.size):
+        for e in range(offsets[q], offsets[q + 1]):
+            own[rows[order[e]]] = ids[q]
+    arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
+    return (
+        p[arranged], kind[arranged], visit[arranged], finished[arranged], own[arranged], ids, data, ends, chain_kind,
+        chain_visits,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def looked_at(pieces, apex, heading, points, angles, full, nudge):
+    """Whether the known side of each piece (m, 4) lies in a scan polygon: the scan saw the edge from there."""
+    out = np.zeros(pieces.shape[0], np.bool_)
+    for i in range(pieces.shape[0]):
+        dx = pieces[i, 2] - pieces[i, 0]
+        dy = pieces[i, 3] - pieces[i, 1]
+        size = max(math.hypot(dx, dy), 1e-9)
+        x = 0.5 * (pieces[i, 0] + pieces[i, 2]) - nudge * dy / size - apex[0]
+        y = 0.5 * (pieces[i, 1] + pieces[i, 3]) + nudge * dx / size - apex[1]
+        out[i] = contains(x, y, points, angles, heading, full)
+    return out
 
 
 @njit(cache=True)

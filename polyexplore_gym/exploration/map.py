@@ -14,14 +14,14 @@ from numba import njit
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
-from polyexplore_gym.exploration.path_graph import PathGraph
+from polyexplore_gym.exploration.path_graph import Known, PathGraph
 from polyexplore_gym.scan import Scan
 
 _PIECE = 2.0
 """Open edges are cut into pieces of at most this length, m."""
 _SLACK = 0.3
 """Paths may cross an open edge this near (m) to the node or robot at their end."""
-_TRAIL_STEP = 0.2
+_TRAIL_STEP = 0.3
 """Spacing of the way points on a way driven, m."""
 _SPARE = 0.05
 """Paths round corners keep this much more than the robot's radius, m."""
@@ -228,81 +228,37 @@ class ExplorationMap:
         scan: int,
         measured: int | None,
     ) -> None:
-        """Replace the local pieces by what is left of them, add the fresh ones, and chain what changed anew."""
-        source = local[origin]
-        away = np.ones(len(self.pieces), np.bool_)
-        away[local] = False
-        rest = np.flatnonzero(away)
-        old = np.concatenate((rest, source))
-        n_fresh = len(fresh)
-        lost_chains = np.unique(self.owner[dirty])
-        lost_chains = lost_chains[lost_chains >= 0]
-        pieces = np.concatenate((self.pieces[rest], kept, fresh))
-        kinds = np.concatenate((self.kinds[old], fresh_kinds))
-        visits = np.concatenate((self.visits[old], np.zeros(n_fresh, np.int64)))
-        done = np.concatenate((self.done[old], np.zeros(n_fresh, np.bool_)))
-        owner = np.concatenate((self.owner[old], np.full(n_fresh, -1, np.int64)))
-        stale = np.concatenate((dirty[old], np.ones(n_fresh, np.bool_)))
-        if len(lost_chains):
-            stale |= np.isin(owner, lost_chains)
+        """Put what is left of the local pieces and the fresh ones in their place; make new chains where needed."""
+        finished = np.zeros(len(kept), np.bool_)
         if measured is not None:
-            for i in np.flatnonzero(owner == measured):
-                if self._looked_at(pieces[i], scan):
-                    done[i] = True
-        done |= visits >= self.config.max_visits
-        stale &= ~done
-        owner[done] = -1
-        # A changed piece may now touch a chain that did not change.
-        while True:
-            hit = jump_edges.touching_chains(pieces, np.where(done, -1, owner), stale, self.join)
-            more = np.unique(owner[hit])
-            if not len(more):
-                break
-            lost_chains = np.union1d(lost_chains, more)
-            stale |= np.isin(owner, more)
-        rows = np.flatnonzero(stale)
-        order, offsets = jump_edges.link(pieces[rows], self.join, self.min_gap, self.sensor.max_range)
-        data, ends, kind, visit = jump_edges.summarise(pieces[rows], kinds[rows], visits[rows], order, offsets)
-        c = len(kind)
-        ids = np.arange(self._next_id, self._next_id + c)
-        self._next_id += c
-        owner[rows[order]] = np.repeat(ids, np.diff(offsets))
-        # Keep the pieces of each chain together and in order: nodes are placed along them.
-        arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
-        self.pieces, self.kinds, self.visits = pieces[arranged], kinds[arranged], visits[arranged]
-        self.done, self.owner = done[arranged], owner[arranged]
-        long_enough = data[:, 0] >= self.min_gap
-        m = int(long_enough.sum())
+            finished = jump_edges.looked_at(
+                kept, self.apexes[scan], self.headings[scan], self.points[scan], self.angles, self.full, self.nudge
+            ) & (self.owner[local[origin]] == measured)
+        self.pieces, self.kinds, self.visits, self.done, self.owner, ids, data, ends, kind, visits = (
+            jump_edges.rechain(
+                self.pieces, self.kinds, self.visits, self.done, self.owner, dirty, local, kept, origin, fresh,
+                fresh_kinds, finished, self.config.max_visits, self.join, self.min_gap, self.sensor.max_range,
+                self._next_id,
+            )
+        )  # fmt: skip
+        alive = np.zeros(self._next_id + len(ids) + 1, np.bool_)
+        self._next_id += len(ids)
+        alive[self.owner] = True  # the last one stands for pieces without a chain
+        staying = alive[self.chains.id]
+        self._drop_vertices(self.chains.vertex[~staying])
+        long_enough = np.flatnonzero(data[:, 0] >= self.min_gap)
+        m = len(long_enough)
         added = Chains(
             ids[long_enough], data[long_enough, 0], data[long_enough, 1:3], data[long_enough, 3:5],
-            ends[long_enough], kind[long_enough], visit[long_enough], np.zeros((m, 3)),
+            ends[long_enough], kind[long_enough], visits[long_enough], np.zeros((m, 3)),
             np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
         )  # fmt: skip
-        gone = np.isin(self.chains.id, lost_chains)
-        # A chain may also have vanished without a piece left.
-        gone |= ~np.isin(self.chains.id, self.owner)
-        for v in self.chains.vertex[gone]:
-            if v >= 0:
-                self._drop_vertex(int(v))
-        self.chains = self.chains.take(np.flatnonzero(~gone)).join(added)
+        self.chains = self.chains.take(np.flatnonzero(staying)).join(added)
 
-    def _looked_at(self, piece: np.ndarray, scan: int) -> bool:
-        """Whether the known side of a piece lies in a scan polygon: then the scan looked at it and found no more."""
-        dx, dy = piece[2] - piece[0], piece[3] - piece[1]
-        size = max(math.hypot(dx, dy), 1e-9)
-        x = 0.5 * (piece[0] + piece[2]) - self.nudge * dy / size - self.apexes[scan, 0]
-        y = 0.5 * (piece[1] + piece[3]) + self.nudge * dx / size - self.apexes[scan, 1]
-        return bool(
-            scan_polygon.contains(x, y, self.points[scan], self.angles, float(self.headings[scan]), self.full)
-        )
-
-    def _drop_vertex(self, v: int) -> None:
-        g = self.graph
-        row = np.flatnonzero(g.sources == v)
-        g.remove_leaf(v)
-        if len(row):
-            keep = np.flatnonzero(g.sources != v)
-            g.sources, g.dist, g.parent = g.sources[keep], g.dist[keep], g.parent[keep]
+    def _drop_vertices(self, vertices: np.ndarray) -> None:
+        vertices = vertices[vertices >= 0]
+        if len(vertices):
+            self.graph.remove_leaves(vertices)
 
     def bump(self, pose: np.ndarray, bearing: float) -> None:
         """Remember an obstacle felt at `bearing` (rad, map frame) on the robot's rim at `pose` (3,): plan around it."""
@@ -327,12 +283,16 @@ class ExplorationMap:
                 walls = np.concatenate((self.bumps, walls))
                 alive = np.concatenate((np.ones(len(self.bumps), np.bool_), alive))
                 touched = np.concatenate((np.arange(len(self.bumps)), touched + len(self.bumps)))
-            g.set_walls(walls, alive, touched)
+            n = self.n_scans
+            known = Known(
+                self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range
+            )
+            g.set_walls(walls, alive, touched, known, self._box)
             g.set_pieces(self.pieces, self.owner)
             g.add_way_point(float(pose[0]), float(pose[1]))
             g.refresh(self._box, _SLACK)
         if self.robot >= 0:
-            g.remove_leaf(self.robot)
+            g.remove_leaves(np.array([self.robot]))
         self._start = self._way_out(float(pose[0]), float(pose[1]), came)
         self.robot = g.add_leaf(*self._start[-1], -2, _SLACK)
         reach = self.sensor.max_range
@@ -344,14 +304,14 @@ class ExplorationMap:
         for i in np.flatnonzero(local):
             v = int(c.vertex[i])
             if v >= 0 and g.clearance(c.node[i, 0], c.node[i, 1]) < g.need - 0.02:
-                self._drop_vertex(v)
+                self._drop_vertices(c.vertex[i : i + 1])
                 c.vertex[i] = v = -1
             if v < 0:
                 self._place(int(i))
         self._update_sources()
         if came is not None:
             self._trail.append(came)
-        if len(c) and not np.isfinite(c.path_length).any() and self._trail:
+        if len(c) and not np.isfinite(c.path_length).any() and self._trail and g.is_cut_off(self.robot):
             g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
             self._trail = []
             self._update_sources()
@@ -420,14 +380,12 @@ class ExplorationMap:
     def _place_within(self, i: int, seen: np.ndarray) -> None:
         """Put the node at the reachable place nearest to its jump edge that sees it, or mask it."""
         g, c = self.graph, self.chains
-        v = int(c.vertex[i])
         x, y, heading, found = nodes.nearest_reachable(
             self._rows(int(c.id[i])), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
             self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
         )  # fmt: skip
         if found:
-            if v >= 0:
-                self._drop_vertex(v)
+            self._drop_vertices(c.vertex[i : i + 1])
             self._set_node(i, x, y, heading)
 
     def _set_node(self, i: int, x: float, y: float, heading: float) -> None:

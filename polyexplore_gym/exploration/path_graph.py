@@ -9,10 +9,12 @@ that is repaired where the graph changed, instead of being searched anew (Ramali
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from polyexplore_gym.exploration.scan_polygon import contains
 from polyexplore_gym.exploration.segments import (
     build_grid,
     clearance,
@@ -39,9 +41,13 @@ _ARC = math.pi / 4
 """A path turns round a corner in steps of at most this angle, rad."""
 _TRAIL = 8.0
 """The same, for a place where the robot has driven: no wall refutes that."""
+_TRAIL_EDGE = 0.6
+"""Longest edge (m) from the way driven to anything else."""
 _WAY_POINT = 4.0
 """Where no corner stands within this distance (m) of a scan, the scan's place becomes a vertex itself."""
-_LEEWAY = 0.12
+_SAME = 0.92
+"""Cosine above which a wall leaves its end as it did when the corner was judged: the map breathes."""
+_LEEWAY = 0.15
 """Sine by which a path through a corner vertex may miss being taut: the map is noisy."""
 _FREE = 2.0
 """Stands for the largest sine where a vertex serves every direction past its corner."""
@@ -97,9 +103,43 @@ def _free_sector(ex, ey, walls, start, items):
     return a, a + best, best
 
 
+class Known(NamedTuple):
+    """The scan polygons so far, in the layout of `scan_polygon`: which space is known."""
+
+    apexes: np.ndarray
+    """(s, 2)"""
+    headings: np.ndarray
+    """(s,)"""
+    points: np.ndarray
+    """(s, n, 2) corners about the apex"""
+    angles: np.ndarray
+    """(n,)"""
+    full: bool
+    reach: float
+    """Maximum range, m."""
+
+
 @njit(cache=True)
-def corner_vertices(ends, walls, start, items, rho, need):
+def is_known(x, y, known):
+    """Whether a point lies in a scan polygon; the newest are tried first."""
+    for s in range(known.headings.size - 1, -1, -1):
+        dx = x - known.apexes[s, 0]
+        dy = y - known.apexes[s, 1]
+        if (
+            abs(dx) <= known.reach
+            and abs(dy) <= known.reach
+            and contains(dx, dy, known.points[s], known.angles, known.headings[s], known.full)
+        ):
+            return True
+    return False
+
+
+@njit(cache=True)
+def corner_vertices(ends, walls, start, items, rho, need, known):
     """Vertices around wall ends (m, 2): (v, 2) positions and (v, 7) shapes for the test of tautness.
+
+    Only vertices in known space (all space if nothing is said to be known); third, which ends have
+    more of them waiting in the unknown.
 
     They stand at `rho` from the end on a polyline around it, nearer where the passage is narrow but
     never nearer than `need` to any wall. A shape is the anchor (the wall end), the two bounding wall
@@ -107,10 +147,18 @@ def corner_vertices(ends, walls, start, items, rho, need):
     """
     out = np.empty((16 * ends.shape[0], 2))
     shape = np.empty((out.shape[0], 7))
+    waiting = np.zeros(ends.shape[0], np.bool_)
     count = 0
     for q in range(ends.shape[0]):
         ex = ends[q, 0]
         ey = ends[q, 1]
+        twin = False
+        for p in range(q):
+            if abs(ends[p, 0] - ex) < 0.02 and abs(ends[p, 1] - ey) < 0.02:
+                twin = True
+                break
+        if twin:
+            continue
         a, b, gap = _free_sector(ex, ey, walls, start, items)
         lone = gap > 3.0 * math.pi
         turn = 2.0 * math.pi if lone else gap - math.pi
@@ -141,13 +189,16 @@ def corner_vertices(ends, walls, start, items, rho, need):
                         low = c
                         x = ex + d * ux
                         y = ey + d * uy
-                limit = _FREE
+                limit = _ANY
                 kept = low >= 0.0
                 # The neighbour on the polyline takes over its directions.
-                if last_plain and p > 0:
+                if last_plain and p > 0 and count > 0:
                     shape[count - 1, 6] = _FREE
             if not kept:
                 last_plain = False
+                continue
+            if known.headings.size > 0 and not is_known(x, y, known):
+                waiting[q] = True
                 continue
             out[count, 0] = x
             out[count, 1] = y
@@ -161,7 +212,7 @@ def corner_vertices(ends, walls, start, items, rho, need):
             shape[count, 6] = limit if last_plain else _FREE
             last_plain = limit < _FREE
             count += 1
-    return out[:count].copy(), shape[:count].copy()
+    return out[:count].copy(), shape[:count].copy(), waiting
 
 
 @njit(cache=True)
@@ -191,13 +242,12 @@ def retire(position, kind, shape, n_vertices, touched, walls, start, items, need
         if not near:
             continue
         a, b, gap = _free_sector(ex, ey, walls, start, items)
-        if gap > 3.0 * math.pi:
-            same = shape[v, 2] == 0.0 and shape[v, 3] == 0.0
-        else:
-            same = (
-                shape[v, 2] * math.cos(a) + shape[v, 3] * math.sin(a) > 0.99
-                and shape[v, 4] * math.cos(b) + shape[v, 5] * math.sin(b) > 0.99
-            )
+        same = gap - math.pi >= _FLAT
+        if gap < 3.0 * math.pi:
+            for k, direction in ((2, a), (4, b)):
+                # A direction of zero length stands for any.
+                if shape[v, k] != 0.0 or shape[v, k + 1] != 0.0:
+                    same &= shape[v, k] * math.cos(direction) + shape[v, k + 1] * math.sin(direction) > _SAME
         if same and clearance(position[v, 0], position[v, 1], walls, start, items, REACH) >= need - 0.005:
             continue
         # The vertices of one wall end serve together: judge it anew as a whole.
@@ -242,15 +292,23 @@ def distinct(candidates, forms, position, shape, kind, n_vertices):
     for i in range(m):
         x = candidates[i, 0]
         y = candidates[i, 1]
+        apart = 0.0
         for v in range(n_vertices):
             if kind[v] != CORNER or abs(position[v, 0] - x) > _SPACING or abs(position[v, 1] - y) > _SPACING:
                 continue
             if _absorb(x, y, forms[i], position[v, 0], position[v, 1], shape[v]):
                 keep[i] = False
+                apart = math.hypot(forms[i, 0] - shape[v, 0], forms[i, 1] - shape[v, 1])
                 break
         for j in range(i):
             if keep[i] and keep[j] and _absorb(x, y, forms[i], candidates[j, 0], candidates[j, 1], forms[j]):
                 keep[i] = False
+                apart = math.hypot(forms[i, 0] - forms[j, 0], forms[i, 1] - forms[j, 1])
+        if apart > 0.03:
+            # Its neighbours round the corner now turn to a vertex that stands a little elsewhere.
+            for j in (i - 1, i + 1):
+                if 0 <= j < m and forms[j, 0] == forms[i, 0] and forms[j, 1] == forms[i, 1]:
+                    forms[j, 6] = max(forms[j, 6], _FREE)
     return keep
 
 
@@ -300,7 +358,7 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             if abs(dx) > _MAX_EDGE or abs(dy) > _MAX_EDGE:
                 continue
             d = math.hypot(dx, dy)
-            if d > _MAX_EDGE:
+            if d > _MAX_EDGE or (d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= _TRAIL):
                 continue
             d1 = max(d, 1e-9)
             if kind[u] == CORNER and not _tangent(dx / d1, dy / d1, ux, uy, shape[u]):
@@ -357,7 +415,7 @@ def unblock(ends, state, n_edges, position, kind, box, pieces, p_start, p_items,
 
 
 @njit(cache=True)
-def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shape, walls, need):
+def block_by_walls(ends, state, wants, length, n_edges, position, kind, n_vertices, shape, walls, need):
     """Kill the corner vertices and the edges that new walls (m, 4) come too near to; the edges that were open."""
     killed = np.empty(n_edges, np.int64)
     count = 0
@@ -388,19 +446,18 @@ def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shap
             ay = position[u, 1]
             bx = position[v, 0]
             by = position[v, 1]
-            ex0 = min(ax, bx) - need
-            ex1 = max(ax, bx) + need
-            ey0 = min(ay, by) - need
-            ey1 = max(ay, by) + need
-            if ex1 < x0 or ex0 > x1 or ey1 < y0 or ey0 > y1:
+            if max(ax, bx) < x0 or min(ax, bx) > x1 or max(ay, by) < y0 or min(ay, by) > y1:
                 continue
+            ux = (bx - ax) / max(length[e], 1e-9)
+            uy = (by - ay) / max(length[e], 1e-9)
             for w in range(walls.shape[0]):
-                if (
-                    max(walls[w, 0], walls[w, 2]) < ex0
-                    or min(walls[w, 0], walls[w, 2]) > ex1
-                    or max(walls[w, 1], walls[w, 3]) < ey0
-                    or min(walls[w, 1], walls[w, 3]) > ey1
-                ):
+                n1 = ux * (walls[w, 1] - ay) - uy * (walls[w, 0] - ax)
+                n2 = ux * (walls[w, 3] - ay) - uy * (walls[w, 2] - ax)
+                if (n1 > need and n2 > need) or (n1 < -need and n2 < -need):
+                    continue
+                t1 = ux * (walls[w, 0] - ax) + uy * (walls[w, 1] - ay)
+                t2 = ux * (walls[w, 2] - ax) + uy * (walls[w, 3] - ay)
+                if (t1 < -need and t2 < -need) or (t1 > length[e] + need and t2 > length[e] + need):
                     continue
                 # A wall refitted a few millimetres nearer does not cut the edge: it would flicker.
                 if (
@@ -418,14 +475,28 @@ def block_by_walls(ends, state, wants, n_edges, position, kind, n_vertices, shap
 
 
 @njit(cache=True)
-def link_edges(ends, first, last, head, nxt):
-    """Thread the edges `first` to `last` into the adjacency lists (half-edge 2e at its u, 2e + 1 at its v)."""
-    for e in range(first, last):
-        for side in range(2):
-            v = ends[e, side]
-            h = 2 * e + side
-            nxt[h] = head[v]
-            head[v] = h
+def adjacency(ends, state, length, n_edges, kind, n_vertices):
+    """Open edges by vertex: `first` (v + 1,) into `target` and `cost`; marks edges of dead vertices as dead."""
+    first = np.zeros(n_vertices + 1, np.int64)
+    for e in range(n_edges):
+        if state[e] != DEAD and (kind[ends[e, 0]] < 0 or kind[ends[e, 1]] < 0):
+            state[e] = DEAD
+        if state[e] == OPEN:
+            first[ends[e, 0] + 1] += 1
+            first[ends[e, 1] + 1] += 1
+    for v in range(n_vertices):
+        first[v + 1] += first[v]
+    target = np.empty(first[n_vertices], np.int64)
+    cost = np.empty(first[n_vertices])
+    fill = first[:-1].copy()
+    for e in range(n_edges):
+        if state[e] == OPEN:
+            for side in range(2):
+                v = ends[e, side]
+                target[fill[v]] = ends[e, 1 - side]
+                cost[fill[v]] = length[e]
+                fill[v] += 1
+    return first, target, cost
 
 
 @njit(cache=True, inline="always")
@@ -465,7 +536,7 @@ def _pop(heap_d, heap_v, size):
 
 
 @njit(cache=True)
-def _settle(dist, parent, source, heap_d, heap_v, size, ends, state, length, head, nxt, kind):
+def _settle(dist, parent, source, heap_d, heap_v, size, first, target, cost, kind):
     """Dijkstra from a heap that is already filled; leaves but the source are not gone through."""
     while size > 0:
         d = heap_d[0]
@@ -474,43 +545,37 @@ def _settle(dist, parent, source, heap_d, heap_v, size, ends, state, length, hea
         size -= 1
         if d > dist[v] or (kind[v] == LEAF and v != source):
             continue
-        h = head[v]
-        while h >= 0:
-            e = h >> 1
-            if state[e] == OPEN:
-                w = ends[e, 1 - (h & 1)]
-                nd = d + length[e]
-                if nd < dist[w]:
-                    dist[w] = nd
-                    parent[w] = v
-                    if kind[w] != LEAF:
-                        if size == heap_d.size:
-                            heap_d = np.concatenate((heap_d, np.empty(size)))
-                            heap_v = np.concatenate((heap_v, np.empty(size, np.int64)))
-                        _push(heap_d, heap_v, size, nd, w)
-                        size += 1
-            h = nxt[h]
+        for h in range(first[v], first[v + 1]):
+            w = target[h]
+            nd = d + cost[h]
+            if nd < dist[w]:
+                dist[w] = nd
+                parent[w] = v
+                if kind[w] != LEAF:
+                    if size == heap_d.size:
+                        heap_d = np.concatenate((heap_d, np.empty(size)))
+                        heap_v = np.concatenate((heap_v, np.empty(size, np.int64)))
+                    _push(heap_d, heap_v, size, nd, w)
+                    size += 1
 
 
 @njit(cache=True)
-def search(dist, parent, source, ends, state, length, head, nxt, kind, n_vertices):
+def search(dist, parent, source, first, target, cost, kind):
     """Fill the field of one source: shortest distances (v,) and the parents on the way back to it."""
-    for v in range(n_vertices):
-        dist[v] = math.inf
-        parent[v] = -1
+    dist[:] = math.inf
+    parent[:] = -1
     dist[source] = 0.0
     heap_d = np.empty(1024)
     heap_v = np.empty(1024, np.int64)
     heap_d[0] = 0.0
     heap_v[0] = source
-    _settle(dist, parent, source, heap_d, heap_v, 1, ends, state, length, head, nxt, kind)
+    _settle(dist, parent, source, heap_d, heap_v, 1, first, target, cost, kind)
 
 
 @njit(cache=True)
-def repair(dist, parent, sources, killed, added, ends, state, length, head, nxt, kind):
+def repair(dist, parent, sources, killed, added, ends, state, length, first, target, cost, kind):
     """Repair the fields dist, parent (k, v) of `sources` after edges were killed and added (or opened)."""
-    n = dist.shape[1]
-    affected = np.empty(n, np.int64)
+    affected = np.empty(dist.shape[1], np.int64)
     for k in range(sources.size):
         s = sources[k]
         d = dist[k]
@@ -529,29 +594,23 @@ def repair(dist, parent, sources, killed, added, ends, state, length, head, nxt,
         while i < n_hit:
             v = affected[i]
             i += 1
-            h = head[v]
-            while h >= 0:
-                w = ends[h >> 1, 1 - (h & 1)]
+            for h in range(first[v], first[v + 1]):
+                w = target[h]
                 if p[w] == v and d[w] < math.inf:
                     p[w] = -1
                     d[w] = math.inf
                     affected[n_hit] = w
                     n_hit += 1
-                h = nxt[h]
         heap_d = np.empty(256 + n_hit + 2 * added.size)
         heap_v = np.empty(heap_d.size, np.int64)
         size = 0
         for i in range(n_hit):
             v = affected[i]
-            h = head[v]
-            while h >= 0:
-                e = h >> 1
-                if state[e] == OPEN:
-                    w = ends[e, 1 - (h & 1)]
-                    if (kind[w] != LEAF or w == s) and d[w] + length[e] < d[v]:
-                        d[v] = d[w] + length[e]
-                        p[v] = w
-                h = nxt[h]
+            for h in range(first[v], first[v + 1]):
+                w = target[h]
+                if (kind[w] != LEAF or w == s) and d[w] + cost[h] < d[v]:
+                    d[v] = d[w] + cost[h]
+                    p[v] = w
             if d[v] < math.inf and kind[v] != LEAF:
                 _push(heap_d, heap_v, size, d[v], v)
                 size += 1
@@ -568,7 +627,7 @@ def repair(dist, parent, sources, killed, added, ends, state, length, head, nxt,
                     if kind[v] != LEAF:
                         _push(heap_d, heap_v, size, d[v], v)
                         size += 1
-        _settle(d, p, s, heap_d, heap_v, size, ends, state, length, head, nxt, kind)
+        _settle(d, p, s, heap_d, heap_v, size, first, target, cost, kind)
 
 
 @njit(cache=True)
@@ -613,10 +672,10 @@ def retreat(x, y, walls, start, items, need):
 
 
 @njit(cache=True)
-def reachable(root, ends, state, head, nxt, kind, n_vertices):
+def reachable(root, first, target, kind):
     """Which vertices an open path joins to `root`."""
-    seen = np.zeros(n_vertices, np.bool_)
-    stack = np.empty(n_vertices, np.int64)
+    seen = np.zeros(first.size - 1, np.bool_)
+    stack = np.empty(seen.size, np.int64)
     stack[0] = root
     seen[root] = True
     size = 1
@@ -625,17 +684,17 @@ def reachable(root, ends, state, head, nxt, kind, n_vertices):
         v = stack[size]
         if kind[v] == LEAF and v != root:
             continue
-        h = head[v]
-        while h >= 0:
-            e = h >> 1
-            if state[e] == OPEN:
-                w = ends[e, 1 - (h & 1)]
-                if not seen[w]:
-                    seen[w] = True
-                    stack[size] = w
-                    size += 1
-            h = nxt[h]
+        for h in range(first[v], first[v + 1]):
+            w = target[h]
+            if not seen[w]:
+                seen[w] = True
+                stack[size] = w
+                size += 1
     return seen
+
+
+EVERYTHING = Known(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)), np.array([0.0, 1.0]), False, 0.0)
+"""No limit to what is known."""
 
 
 class PathGraph:
@@ -654,15 +713,15 @@ class PathGraph:
         self.kind = np.full(256, -1, np.int8)
         self.relaxed = np.full(256, math.inf)
         self.owner = np.full(256, -1, np.int64)
-        self.head = np.full(256, -1, np.int64)
         self.n_edges = 0
         self.ends = np.zeros((1024, 2), np.int64)
         self.length = np.zeros(1024)
         self.state = np.zeros(1024, np.int8)
         self.wants = np.zeros(1024)
-        self.nxt = np.full(2048, -1, np.int64)
+        self._open: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self.free_ids = np.zeros(0, np.int64)
         self._fresh = np.zeros(0, np.int64)
+        self.waiting = np.zeros((0, 2))
         self.sources = np.zeros(0, np.int64)
         self.dist = np.zeros((0, 256))
         self.parent = np.zeros((0, 256), np.int64)
@@ -676,8 +735,18 @@ class PathGraph:
 
     # Obstacles -------------------------------------------------------------------------------
 
-    def set_walls(self, walls: np.ndarray, alive: np.ndarray, touched: np.ndarray) -> None:
-        """Take over the walls (m, 4) of the line map; `touched` rows changed since the last call."""
+    def set_walls(
+        self,
+        walls: np.ndarray,
+        alive: np.ndarray,
+        touched: np.ndarray,
+        known: Known = EVERYTHING,
+        box: np.ndarray | None = None,
+    ) -> None:
+        """Take over the walls (m, 4) of the line map; `touched` rows changed since the last call.
+
+        `known` tells which space is known, `box` (x0, y0, x1, y1) where that may have changed.
+        """
         self.walls = walls
         self.wall_grid = build_grid(walls, alive, REACH)
         rows = touched[alive[touched]]
@@ -685,13 +754,18 @@ class PathGraph:
             self.position, self.kind, self.shape, self.n_vertices, walls[touched], walls, *self.wall_grid, self.need
         )
         killed = block_by_walls(
-            self.ends, self.state, self.wants, self.n_edges, self.position, self.kind, self.n_vertices, self.shape,
+            self.ends, self.state, self.wants, self.length, self.n_edges, self.position, self.kind, self.n_vertices, self.shape,
             walls[rows], self.need,
         )  # fmt: skip
         if killed.size:
             self._killed.append(killed)
-        ends = np.concatenate((again, walls[rows, :2], walls[rows, 2:]))
-        candidates, shape = corner_vertices(ends, walls, *self.wall_grid, self.rho, self.need)
+        waiting = self.waiting
+        if box is not None:
+            inside = ((waiting >= box[:2]) & (waiting <= box[2:])).all(axis=1)
+            waiting, self.waiting = waiting[inside], waiting[~inside]
+        ends = np.concatenate((again, walls[rows, :2], walls[rows, 2:], waiting))
+        candidates, shape, more = corner_vertices(ends, walls, *self.wall_grid, self.rho, self.need, known)
+        self.waiting = np.concatenate((self.waiting, ends[more]))
         keep = distinct(candidates, shape, self.position, self.shape, self.kind, self.n_vertices)
         self._fresh = self._new_vertices(candidates[keep], shape[keep])
 
@@ -707,6 +781,7 @@ class PathGraph:
             self.ends, self.state, self.n_edges, self.position, self.kind, box, self.pieces, *self.piece_grid,
             self.piece_owner, self.owner, slack,
         )  # fmt: skip
+        self._open = None
         if opened.size:
             self._added.append(opened)
         self._connect(self._fresh, slack)
@@ -718,7 +793,13 @@ class PathGraph:
         self._killed, self._added = [], []
         if len(self.sources) and (killed.size or added.size):
             repair(self.dist, self.parent, self.sources, killed, added, self.ends, self.state, self.length,
-                   self.head, self.nxt, self.kind)  # fmt: skip
+                   *self.open_edges(), self.kind)  # fmt: skip
+
+    def open_edges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The open edges by vertex, see `adjacency`; made anew when the graph has changed."""
+        if self._open is None:
+            self._open = adjacency(self.ends, self.state, self.length, self.n_edges, self.kind, self.n_vertices)
+        return self._open
 
     def add_way_point(self, x: float, y: float) -> None:
         """Make a place where the robot stood a vertex, if corners are far: halls have none in their middle."""
@@ -741,15 +822,17 @@ class PathGraph:
         self._connect(at, slack)
         return v
 
-    def remove_leaf(self, v: int) -> None:
-        """Take a leaf out; no other path leads through it."""
-        h = self.head[v]
-        while h >= 0:
-            self.state[h >> 1] = DEAD
-            h = self.nxt[h]
-        self.kind[v] = -1
-        self.dist[:, v] = math.inf
-        self.parent[:, v] = -1
+    def remove_leaves(self, vertices: np.ndarray) -> None:
+        """Take leaves out, and their fields; no other path leads through them."""
+        self._open = None
+        self.kind[vertices] = -1
+        gone = np.zeros(len(self.kind), np.bool_)
+        gone[vertices] = True
+        if gone[self.sources].any():
+            keep = ~gone[self.sources]
+            self.sources, self.dist, self.parent = self.sources[keep], self.dist[keep], self.parent[keep]
+        self.dist[:, vertices] = math.inf
+        self.parent[:, vertices] = -1
 
     def _new_vertices(self, position: np.ndarray, shape: np.ndarray, kind: int = CORNER, owner: int = -1) -> np.ndarray:
         m = len(position)
@@ -764,7 +847,7 @@ class PathGraph:
         self.kind[ids] = kind
         self.owner[ids] = owner
         self.relaxed[ids] = math.inf
-        self.head[ids] = -1
+        self._open = None
         return ids
 
     def _grow_vertices(self, size: int) -> None:
@@ -779,7 +862,6 @@ class PathGraph:
         self.kind = np.concatenate((self.kind, np.full(extra, -1, np.int8)))
         self.relaxed = np.concatenate((self.relaxed, np.full(extra, math.inf)))
         self.owner = np.concatenate((self.owner, np.full(extra, -1, np.int64)))
-        self.head = np.concatenate((self.head, np.full(extra, -1, np.int64)))
         k = len(self.sources)
         self.dist = np.concatenate((self.dist, np.full((k, extra), math.inf)), axis=1)
         self.parent = np.concatenate((self.parent, np.full((k, extra), -1, np.int64)), axis=1)
@@ -812,31 +894,29 @@ class PathGraph:
             self.length = np.concatenate((self.length, np.zeros(extra)))
             self.state = np.concatenate((self.state, np.zeros(extra, np.int8)))
             self.wants = np.concatenate((self.wants, np.zeros(extra)))
-            self.nxt = np.concatenate((self.nxt, np.full(2 * extra, -1, np.int64)))
         rows = slice(first, first + m)
         self.ends[rows] = pairs
         self.length[rows] = length
         self.state[rows] = state
         self.wants[rows] = wants
         self.n_edges += m
-        link_edges(self.ends, first, self.n_edges, self.head, self.nxt)
+        self._open = None
         self._added.append(np.arange(first, self.n_edges))
 
     def compact(self) -> None:
-        """Drop dead edges and free the indices of dead vertices. Call after `repair`."""
-        self.free_ids = np.flatnonzero(self.kind[: self.n_vertices] < 0)
+        """Drop dead edges, then free the indices of dead vertices. Call after `repair`."""
+        self.open_edges()
         alive = np.flatnonzero(self.state[: self.n_edges])
-        if len(alive) > 0.6 * self.n_edges or self.n_edges < 512:
+        if len(alive) > 0.6 * self.n_edges and len(self.free_ids):
             return
         n = len(alive)
         self.ends[:n] = self.ends[alive]
         self.length[:n] = self.length[alive]
         self.state[:n] = self.state[alive]
         self.wants[:n] = self.wants[alive]
-        self.state[n:] = DEAD
+        self.state[n : self.n_edges] = DEAD
         self.n_edges = n
-        self.head[:] = -1
-        link_edges(self.ends, 0, n, self.head, self.nxt)
+        self.free_ids = np.flatnonzero(self.kind[: self.n_vertices] < 0)
 
     def retreat(self, x: float, y: float) -> tuple[float, float, bool]:
         """Where to go first from a place nearer to a wall than paths are, and whether there is such a place."""
@@ -856,8 +936,7 @@ class PathGraph:
         parent[kept] = self.parent[rows[kept]]
         self.dist, self.parent, self.sources = dist, parent, np.asarray(vertices, np.int64)
         for k in np.flatnonzero(~kept):
-            search(dist[k], parent[k], self.sources[k], self.ends, self.state, self.length, self.head, self.nxt,
-                   self.kind, self.n_vertices)  # fmt: skip
+            search(dist[k], parent[k], self.sources[k], *self.open_edges(), self.kind)
 
     def path(self, row: int, vertex: int) -> np.ndarray:
         """Way points (k, 2) from a vertex to the source of a field, both included."""
@@ -868,6 +947,12 @@ class PathGraph:
             points.append(self.position[v])
         return np.array(points)
 
+    def is_cut_off(self, root: int) -> bool:
+        """Whether no path leads from `root` to most of the corners, as where a tight place was entered."""
+        corners = self.kind[: self.n_vertices] == CORNER
+        return bool(self.reachable(root)[corners].sum() < 0.5 * corners.sum())
+
     def reachable(self, root: int) -> np.ndarray:
         """Which vertices (n_vertices,) an open path joins to `root`."""
-        return reachable(root, self.ends, self.state, self.head, self.nxt, self.kind, self.n_vertices)
+        first, target, _ = self.open_edges()
+        return reachable(root, first, target, self.kind)

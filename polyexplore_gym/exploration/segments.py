@@ -136,10 +136,9 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
     tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
     ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
     steps = abs(jx - ix) + abs(jy - iy)
-    x0 = min(ax, bx) - radius
-    x1 = max(ax, bx) + radius
-    y0 = min(ay, by) - radius
-    y1 = max(ay, by) + radius
+    length = math.hypot(dx, dy)
+    ux = dx / length if length > 0.0 else 1.0
+    uy = dy / length if length > 0.0 else 0.0
     for _ in range(steps + 1):
         b = bucket(ix, iy, mask)
         for e in range(start[b], start[b + 1]):
@@ -148,7 +147,14 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
             cy = segments[i, 1]
             ex = segments[i, 2]
             ey = segments[i, 3]
-            if max(cx, ex) < x0 or min(cx, ex) > x1 or max(cy, ey) < y0 or min(cy, ey) > y1:
+            # Most walls lie beside, before or behind the strip that the disc sweeps.
+            n1 = ux * (cy - ay) - uy * (cx - ax)
+            n2 = ux * (ey - ay) - uy * (ex - ax)
+            if (n1 > radius and n2 > radius) or (n1 < -radius and n2 < -radius):
+                continue
+            t1 = ux * (cx - ax) + uy * (cy - ay)
+            t2 = ux * (ex - ax) + uy * (ey - ay)
+            if (t1 < -radius and t2 < -radius) or (t1 > length + radius and t2 > length + radius):
                 continue
             if segment_distance(ax, ay, bx, by, cx, cy, ex, ey) < radius:
                 return False
