@@ -10,7 +10,6 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cloudpickle
@@ -366,9 +365,8 @@ def test_bad_plan_files(tmp_path):
 
 def test_reset_takes_a_plan_and_a_start(house_path):
     env = PolyExploreEnv(ROOM, config=KINEMATIC)
-    for plan, start in itertools.product(
-        (HOUSE, house_path, Path(house_path)), ((1.0, 2.0, 0.5), np.array([1, 2, 0.5]))
-    ):
+    starts = (1.0, 2.0, 0.5), np.array([1, 2, 0.5])
+    for plan, start in itertools.product((HOUSE, house_path, Path(house_path)), starts):
         env.reset(seed=0, options={"plan": plan, "start": start})
         assert env.plan == HOUSE
         np.testing.assert_allclose(env.snapshot().trajectory[0], start)
@@ -455,10 +453,10 @@ def test_look_around():
 # Step --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "action",
-    [-1, 64, 10**9, 1.0, 0.5, math.nan, "0", None, True, np.bool_(True), [0], (0,), np.array([0]), np.float32(1)],
-)
+REFUSED = [-1, 64, 10**9, 1.0, 0.5, math.nan, "0", None, True, np.bool_(True), [0], (0,), np.array([0]), np.float32(1)]
+
+
+@pytest.mark.parametrize("action", REFUSED, ids=repr)
 def test_actions_that_are_refused(action):
     env = PolyExploreEnv(HOUSE, config=KINEMATIC)
     _, info = env.reset(seed=0)
@@ -642,9 +640,8 @@ def test_scans_on_the_way():
         for _, _, _, info, before in play(env, seed=1):
             driven = info["distance"] - before["distance"]
             marks = len(np.arange(0.5, driven - 0.25, 0.5)) if driven > 0.75 else 0
-            assert info["measurements"] - before["measurements"] == pytest.approx(
-                1 + marks, abs=1e-6 + (driven % 0.5 > 0.2)
-            )
+            slack = 1 if abs(driven % 0.5 - 0.25) < 1e-6 else 0  # rounding decides on the last one
+            assert abs(info["measurements"] - before["measurements"] - 1 - marks) <= slack
         scene = env.snapshot()
         way = shapely.LineString(scene.trajectory[:, :2])
         assert max(way.distance(shapely.Point(p)) for p in scene.measured_at[:, :2]) < 1e-9
@@ -721,15 +718,13 @@ def test_relative_observations_are_the_absolute_ones_transformed(mode):
                 np.testing.assert_allclose(ends, values[4], atol=0.02)
             if expected[1] < 1e-3:
                 continue  # no derivative: the normal flips
-            step = 1e-6
-            jacobian = np.stack(
-                [
-                    (line_seen_from(alpha + da, rho + dr, pose) - line_seen_from(alpha - da, rho - dr, pose))
-                    / (2 * step)
-                    for da, dr in ((step, 0.0), (0.0, step))
-                ],
-                axis=1,
+            ahead, behind = (
+                np.stack([line_seen_from(alpha + h, rho, pose), line_seen_from(alpha, rho + h, pose)], axis=1)
+                for h in (1e-6, -1e-6)
             )
+            difference = ahead - behind
+            difference[0] = np.angle(np.exp(1j * difference[0]))
+            jacobian = difference / 2e-6
             p = np.array([[row[6], row[7]], [row[7], row[8]]])
             q = jacobian @ p @ jacobian.T
             scale = 1e-5 * (p[1, 1] + p[0, 0] * (1 + (pose[:2] ** 2).sum()))  # float32 cancels
@@ -764,10 +759,8 @@ def test_the_farthest_nodes_are_cut_first():
     few = PolyExploreEnv(generate("office", 2), config={**KINEMATIC, "observation": {"max_nodes": 3}})
     many = PolyExploreEnv(generate("office", 2), config=KINEMATIC)
     full, _ = many.reset(seed=3)
-    rng = np.random.default_rng(0)
     cut = 0
-    for action, short, _, info, _ in play(few, seed=3, limit=15):
-        del action
+    for _, short, _, info, _ in play(few, seed=3, limit=15):
         place = few.snapshot().path[-1]
         row = int(np.hypot(*(full["node_position"] - place).T).argmin())
         full, _, _, _, told = many.step(row)
@@ -782,7 +775,6 @@ def test_the_farthest_nodes_are_cut_first():
                 assert (full[key][same] == short[key][i]).all()
         cut += n > 3
     assert cut > 3
-    assert rng is not None
 
 
 def test_path_lengths_between_nodes():
@@ -860,4 +852,3 @@ def test_snapshots_do_not_change_later():
         env.step(action)
     assert pickle.dumps(scene) == kept
     assert scene.node_mask[action]
-    assert isinstance(scene, SimpleNamespace) is False
