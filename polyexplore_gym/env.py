@@ -45,7 +45,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     Version history: v0, the first.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # type: ignore[misc]
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.render_mode = render_mode
         self._suite = None if suite is None else _suite(suite)
         self._plan = None if plan is None else self._checked(plan)
-        self.observation_space = observation.space(self.config.observation)
+        self.observation_space = observation.space(self.config.observation)  # type: ignore[assignment]
         self.action_space = spaces.Discrete(self.config.observation.max_nodes)
         self._world: World | None = None
         self._window: Any = None
