@@ -33,7 +33,7 @@ _NEIGHBOURHOOD = 0.25
 """Radius (m) of the circle around a wall end on which its corner is judged: raggedness below it is no corner."""
 _SPACING = 0.1
 """Two vertices nearer than this (m) are one."""
-_MAX_EDGE = 12.0
+_MAX_EDGE = 10.0
 """Longest edge of the graph, m."""
 _FLAT = 0.2
 """A corner that turns less than this (rad) beyond straight gets no vertex."""
@@ -120,9 +120,9 @@ class Known(NamedTuple):
 
 
 @njit(cache=True)
-def is_known(x, y, known):
-    """Whether a point lies in a scan polygon; the newest are tried first."""
-    for s in range(known.headings.size - 1, -1, -1):
+def is_known(x, y, known, since):
+    """Whether a point lies in a scan polygon from number `since` on; the newest are tried first."""
+    for s in range(known.headings.size - 1, since - 1, -1):
         dx = x - known.apexes[s, 0]
         dy = y - known.apexes[s, 1]
         if (
@@ -135,11 +135,12 @@ def is_known(x, y, known):
 
 
 @njit(cache=True)
-def corner_vertices(ends, walls, start, items, rho, need, known):
+def corner_vertices(ends, walls, start, items, rho, need, known, waited, since):
     """Vertices around wall ends (m, 2): (v, 2) positions and (v, 7) shapes for the test of tautness.
 
     Only vertices in known space (all space if nothing is said to be known); third, which ends have
-    more of them waiting in the unknown.
+    more of them waiting in the unknown. The ends from number `waited` on were judged before: for
+    them only the scans from number `since` on can have news.
 
     They stand at `rho` from the end on a polyline around it, nearer where the passage is narrow but
     never nearer than `need` to any wall. A shape is the anchor (the wall end), the two bounding wall
@@ -197,7 +198,7 @@ def corner_vertices(ends, walls, start, items, rho, need, known):
             if not kept:
                 last_plain = False
                 continue
-            if known.headings.size > 0 and not is_known(x, y, known):
+            if known.headings.size > 0 and not is_known(x, y, known, since if q >= waited else 0):
                 waiting[q] = True
                 continue
             out[count, 0] = x
@@ -236,6 +237,13 @@ def retire(position, kind, shape, n_vertices, touched, walls, start, items, need
             continue
         near = False
         for w in range(touched.shape[0]):
+            if (
+                max(touched[w, 0], touched[w, 2]) < ex - reach
+                or min(touched[w, 0], touched[w, 2]) > ex + reach
+                or max(touched[w, 1], touched[w, 3]) < ey - reach
+                or min(touched[w, 1], touched[w, 3]) > ey + reach
+            ):
+                continue
             if point_segment_distance(ex, ey, touched[w, 0], touched[w, 1], touched[w, 2], touched[w, 3]) < reach:
                 near = True
                 break
@@ -426,6 +434,11 @@ def block_by_walls(ends, state, wants, length, n_edges, position, kind, n_vertic
         x1 = max(x1, walls[w, 0] + need, walls[w, 2] + need)
         y0 = min(y0, walls[w, 1] - need, walls[w, 3] - need)
         y1 = max(y1, walls[w, 1] + need, walls[w, 3] + need)
+    middle = np.empty((walls.shape[0], 3))  # and the radius of a disc that holds the inflated wall
+    for w in range(walls.shape[0]):
+        middle[w, 0] = 0.5 * (walls[w, 0] + walls[w, 2])
+        middle[w, 1] = 0.5 * (walls[w, 1] + walls[w, 3])
+        middle[w, 2] = 0.5 * math.hypot(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + need
     for v in range(n_vertices):
         x = position[v, 0]
         y = position[v, 1]
@@ -451,13 +464,11 @@ def block_by_walls(ends, state, wants, length, n_edges, position, kind, n_vertic
             ux = (bx - ax) / max(length[e], 1e-9)
             uy = (by - ay) / max(length[e], 1e-9)
             for w in range(walls.shape[0]):
-                n1 = ux * (walls[w, 1] - ay) - uy * (walls[w, 0] - ax)
-                n2 = ux * (walls[w, 3] - ay) - uy * (walls[w, 2] - ax)
-                if (n1 > need and n2 > need) or (n1 < -need and n2 < -need):
-                    continue
-                t1 = ux * (walls[w, 0] - ax) + uy * (walls[w, 1] - ay)
-                t2 = ux * (walls[w, 2] - ax) + uy * (walls[w, 3] - ay)
-                if (t1 < -need and t2 < -need) or (t1 > length[e] + need and t2 > length[e] + need):
+                cx = middle[w, 0] - ax
+                cy = middle[w, 1] - ay
+                if abs(ux * cy - uy * cx) > middle[w, 2] or abs(ux * cx + uy * cy - 0.5 * length[e]) > (
+                    middle[w, 2] + 0.5 * length[e]
+                ):
                     continue
                 # A wall refitted a few millimetres nearer does not cut the edge: it would flicker.
                 if (
@@ -722,6 +733,7 @@ class PathGraph:
         self.free_ids = np.zeros(0, np.int64)
         self._fresh = np.zeros(0, np.int64)
         self.waiting = np.zeros((0, 2))
+        self._scans_known = 0
         self.sources = np.zeros(0, np.int64)
         self.dist = np.zeros((0, 256))
         self.parent = np.zeros((0, 256), np.int64)
@@ -764,7 +776,10 @@ class PathGraph:
             inside = ((waiting >= box[:2]) & (waiting <= box[2:])).all(axis=1)
             waiting, self.waiting = waiting[inside], waiting[~inside]
         ends = np.concatenate((again, walls[rows, :2], walls[rows, 2:], waiting))
-        candidates, shape, more = corner_vertices(ends, walls, *self.wall_grid, self.rho, self.need, known)
+        candidates, shape, more = corner_vertices(
+            ends, walls, *self.wall_grid, self.rho, self.need, known, len(ends) - len(waiting), self._scans_known
+        )
+        self._scans_known = len(known.headings)
         self.waiting = np.concatenate((self.waiting, ends[more]))
         keep = distinct(candidates, shape, self.position, self.shape, self.kind, self.n_vertices)
         self._fresh = self._new_vertices(candidates[keep], shape[keep])
