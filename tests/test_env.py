@@ -627,10 +627,9 @@ def test_whole_episodes_of_every_family(family):
 @pytest.mark.parametrize("name", VARIATIONS)
 @pytest.mark.parametrize("family", ["home", "office", "angled"])
 def test_whole_episodes_of_every_kind_and_family(family, name):
-    for seed in range(2):
-        config = {"max_decisions": 300, **VARIATIONS[name]}
-        for _ in play(PolyExploreEnv(generate(family, 20 + seed), config=config), seed=seed):
-            pass
+    config = {"max_decisions": 60, **VARIATIONS[name]}
+    for _ in play(PolyExploreEnv(generate(family, 20), config=config), seed=1):
+        pass
 
 
 def test_scans_on_the_way():
