@@ -1,0 +1,175 @@
+"""Does every exploration end by itself? All scripted criteria on all shared plans, through the evaluation library.
+
+    python benchmarks/shared_plans.py [--policies nearest ...] [--placement midpoint in_front] [--drive physics]
+                                      [--noise 1] [--first N] [--workers 2] [--out results/shared_plans]
+
+One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
+coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
+where it stood to measure and anywhere on the way (below 0: overlap; the engine lets a bump go some millimetres deep
+for one time step), and bumps a decision. `--noise` scales the laser's noise of range and angle. A run that was
+stopped goes on where it was with the same arguments.
+
+FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
+beside the checkout.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import shapely
+from plan_statistics import default_folder
+
+from polyexplore_gym.cli import SCRIPTED
+from polyexplore_gym.config import DriveConfig, EnvConfig, SensorConfig
+from polyexplore_gym.env import PolyExploreEnv
+from polyexplore_gym.evaluation import EpisodeRecord, Study, evaluate
+from polyexplore_gym.evaluation.tables import format_table
+from polyexplore_gym.floorplan import FloorPlan, load_plan
+
+CLEARANCES = "clearances.jsonl"
+Key = tuple[str, int]
+"""Plan hash and seed."""
+
+
+class Watched(gymnasium.Wrapper):
+    """Writes down the smallest clearance of the disc when an episode ends."""
+
+    def __init__(self, env: PolyExploreEnv, file: Path) -> None:
+        super().__init__(env)
+        self.file = file
+        self._seed: int | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self._seed = seed
+        observation, info = self.env.reset(seed=seed, options=options)
+        if not info["action_mask"].any():
+            self._write()
+        return observation, info
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        if result[2] or result[3]:
+            self._write()
+        return result
+
+    def _write(self) -> None:
+        env: Any = self.unwrapped
+        snapshot = env.snapshot()
+        line = {
+            "key": [env.plan.content_hash, self._seed],
+            "standing": float(env.plan.clearance(snapshot.measured_at[:, :2]).min()) - snapshot.radius,
+            "on the way": clearance(snapshot.trajectory, env.plan, snapshot.radius),
+        }
+        with self.file.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+@dataclass(frozen=True)
+class MakeWatched:
+    """Makes the environment for the evaluation; a folder is of one policy and placement."""
+
+    folder: Path
+
+    def __call__(self, config: EnvConfig) -> gymnasium.Env:
+        return Watched(PolyExploreEnv(config=config), self.folder / CLEARANCES)
+
+
+def clearance(trajectory: np.ndarray, plan: FloorPlan, radius: float) -> float:
+    """Smallest distance (m) of the disc from the walls along a trajectory (m, 3); negative inside."""
+    way = trajectory[:, :2]
+    moved = np.flatnonzero(np.any(np.diff(way, axis=0) != 0.0, axis=1))
+    steps = np.stack((way[moved], way[moved + 1]), axis=1) if len(moved) else way[None, [0, 0]]
+    tree = shapely.STRtree(shapely.linestrings(plan.segments.reshape(-1, 2, 2)))
+    distances = tree.query_nearest(shapely.linestrings(steps), return_distance=True, all_matches=False)[1]
+    return float(distances.min()) - radius
+
+
+def read_clearances(folder: Path) -> dict[Key, tuple[float, float]]:
+    """Clearance standing and on the way, m; an episode played again counts once, a torn last line not at all."""
+    known: dict[Key, tuple[float, float]] = {}
+    file = folder / CLEARANCES
+    for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
+        try:
+            entry = json.loads(line)
+        except ValueError:
+            continue
+        known[tuple(entry["key"])] = entry["standing"], entry["on the way"]
+    return known
+
+
+def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, float]]) -> list[str]:
+    """The figures of one policy and placement."""
+    played = [r for r in records if r.status != "failed"]
+    ended = sum(r.status == "complete" for r in records)
+    cells = [records[0].policy, records[0].placement, f"{ended}/{len(records)}", f"{len(records) - len(played)}",
+             f"{sum(r.status == 'truncated' for r in records)}"]  # fmt: skip
+    if not played:
+        return [*cells, "-", "-", "-", "-", "-"]
+    least = min(played, key=lambda r: r.coverage)
+    standing, moving = zip(*(clearances[r.plan_hash, r.seed] for r in played), strict=True)
+    decisions = sum(r.decisions for r in played)
+    return [
+        *cells,
+        f"{100 * statistics.median(r.coverage for r in played):.2f}",
+        f"{100 * least.coverage:.2f} ({least.plan})",
+        f"{1e3 * min(standing):.2f}",
+        f"{1e3 * min(moving):.2f} ({played[moving.index(min(moving))].plan})",
+        f"{sum(r.collisions for r in played) / max(decisions, 1):.3f}",
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policies", nargs="+", default=list(SCRIPTED), help="criteria")
+    parser.add_argument("--placement", nargs="+", choices=("midpoint", "in_front"), default=["midpoint", "in_front"])
+    parser.add_argument("--drive", choices=("physics", "kinematic"), default="physics")
+    parser.add_argument("--noise", type=float, default=1.0, help="factor of the laser's noise; 0 for none")
+    parser.add_argument("--seeds", type=int, default=1, help="starts on each plan")
+    parser.add_argument("--first", type=int, help="only the first so many plans")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
+    parser.add_argument("--plans", type=Path, default=default_folder(), help="folder of plan JSON files")
+    parser.add_argument("--out", type=Path, default=Path("results/shared_plans"), help="folder of the results")
+    options = parser.parse_args()
+    plans = [load_plan(path) for path in sorted(options.plans.glob("*.json"))][: options.first]
+    if not plans:
+        raise SystemExit(f"no plans in {options.plans}: name a folder with --plans")
+    sensor = SensorConfig()
+    config = EnvConfig(
+        sensor=replace(
+            sensor, sigma_range=options.noise * sensor.sigma_range, sigma_angle=options.noise * sensor.sigma_angle
+        ),
+        drive=DriveConfig(mode=options.drive),
+    )
+    rows, failed = [], []
+    # A folder for each set of arguments, so that one study never meets the files of another.
+    out = options.out / f"{options.drive}-noise{options.noise:g}-{len(plans)}x{options.seeds}"
+    for policy in options.policies:
+        for placement in options.placement:
+            study = Study(policies={policy: policy}, plans=plans, placements=[placement],
+                          seeds=range(options.seeds), config=config)  # fmt: skip
+            folder = out / f"{policy.replace(':', '_')}-{placement}"
+            records = evaluate(study, out=folder, workers=options.workers, make_env=MakeWatched(folder))
+            rows.append(row(records, read_clearances(folder)))
+            failed += [r for r in records if r.status != "complete"]
+    print(f"\n{len(plans)} plans x {options.seeds} starts, {options.drive}, {options.noise:g} x the laser's noise:\n")
+    header = ("policy", "placement", "ended by itself", "exceptions", "truncated", "seen, median %",
+              "seen, least % (plan)", "clearance standing, least mm", "on the way, least mm (plan)",
+              "bumps a decision")  # fmt: skip
+    print(format_table(header, rows, "markdown"))
+    for r in failed:
+        print(f"\n{r.status}: {r.policy}, {r.placement}, {r.plan}, seed {r.seed}: "
+              f"{r.error or f'{r.decisions} decisions, {100 * r.coverage:.1f} % seen'}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
