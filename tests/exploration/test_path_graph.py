@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import networkx as nx
@@ -10,7 +11,7 @@ import pytest
 import shapely
 from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths
 
-from polyexplore_gym.exploration.path_graph import DEAD, LEAF, OPEN, PathGraph, search
+from polyexplore_gym.exploration.path_graph import DEAD, LEAF, OPEN, PathGraph
 
 RADIUS = 0.25
 SLACK = 0.3
@@ -81,7 +82,7 @@ RAGGED = pytest.mark.xfail(
 
 
 @pytest.mark.parametrize(
-    "family", [pytest.param(f, marks=RAGGED) if f in ("thick rooms", "ragged thick rooms") else f for f in FAMILIES]
+    "family", [pytest.param(f, marks=RAGGED) if f == "ragged thick rooms" else f for f in FAMILIES]
 )
 def test_path_lengths_against_exact_ones(family):
     excess, ratio, lost, lost_in = study(family, range(14))
@@ -140,7 +141,7 @@ def test_open_edges_block_until_they_are_gone_and_never_their_owner():
     graph.repair()
     assert graph.dist[0, node] == pytest.approx(math.hypot(2, 0.5))
     assert graph.dist[0, beyond] == pytest.approx(math.hypot(4, 0.5))
-    graph.remove_leaf(beyond)
+    graph.remove_leaves(np.array([beyond]))
     graph.set_pieces(pieces[:0], np.zeros(0, np.int64))
     graph.refresh(ALL, SLACK)
     graph.repair()
@@ -156,8 +157,8 @@ def exported(graph):
     out.add_nodes_from(np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist())
     for e in np.flatnonzero(graph.state[: graph.n_edges] == OPEN):
         u, v = graph.ends[e]
-        assert graph.kind[u] >= 0
-        assert graph.kind[v] >= 0
+        if min(graph.kind[u], graph.kind[v]) < 0:
+            continue  # a leaf that was taken out
         length = float(graph.length[e])
         assert length == pytest.approx(math.dist(graph.position[u], graph.position[v]))
         if not out.has_edge(u, v) or out.edges[u, v]["weight"] > length:
@@ -168,17 +169,11 @@ def exported(graph):
 def check_fields(graph):
     network = exported(graph)
     leaves = {v for v in network if graph.kind[v] == LEAF}
+    again = copy.deepcopy(graph)
+    again.set_sources(graph.sources, np.full(len(graph.sources), -1))
+    living = graph.kind >= 0
+    np.testing.assert_allclose(graph.dist[:, living], again.dist[:, living], atol=1e-9)
     for k, source in enumerate(graph.sources.tolist()):
-        fresh = np.full_like(graph.dist[k], math.inf)
-        parent = np.full_like(graph.parent[k], -1)
-        search(
-            fresh, parent, source, graph.ends, graph.state, graph.length, graph.head, graph.nxt, graph.kind,
-            graph.n_vertices,
-        )  # fmt: skip
-        alive = graph.kind[: graph.n_vertices] >= 0
-        np.testing.assert_allclose(
-            graph.dist[k, : graph.n_vertices][alive], fresh[: graph.n_vertices][alive], atol=1e-9
-        )
         through = network.subgraph([v for v in network if v not in leaves or v == source])
         lengths = nx.single_source_dijkstra_path_length(through, source)
         for v in network:
@@ -219,11 +214,7 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
         for _ in range(int(rng.integers(0, 5))):
             if leaves and rng.random() < 0.4:
                 v = leaves.pop(int(rng.integers(len(leaves))))
-                row = np.flatnonzero(graph.sources == v)
-                graph.remove_leaf(v)
-                if len(row):
-                    keep = np.flatnonzero(graph.sources != v)
-                    graph.sources, graph.dist, graph.parent = graph.sources[keep], graph.dist[keep], graph.parent[keep]
+                graph.remove_leaves(np.array([v]))
             else:
                 x, y = rng.uniform(-5, 5, 2)
                 leaves.append(graph.add_leaf(x, y, int(rng.integers(0, 5)), SLACK))
