@@ -49,6 +49,8 @@ _SAME = 0.92
 """Cosine above which a wall leaves its end as it did when the corner was judged: the map breathes."""
 _LEEWAY = 0.15
 """Sine by which a path through a corner vertex may miss being taut: the map is noisy."""
+_SHORT = 0.6
+"""Legs up to this length (m) need not be taut."""
 _FREE = 2.0
 """Stands for the largest sine where a vertex serves every direction past its corner."""
 _ANY = 4.0
@@ -321,9 +323,10 @@ def distinct(candidates, forms, position, shape, kind, n_vertices):
 
 
 @njit(cache=True, inline="always")
-def _tangent(dx, dy, x, y, shape):
-    """Whether a path in direction d (a unit vector) through a corner vertex can be taut."""
-    if shape[6] >= _ANY:
+def _tangent(dx, dy, length, x, y, shape):
+    """Whether a leg in direction d (a unit vector) at a corner vertex can be part of a taut path."""
+    # Short legs turn round one corner, whose vertices need not stand just where they should.
+    if shape[6] >= _ANY or length <= _SHORT:
         return True
     rx = x - shape[0]
     ry = y - shape[1]
@@ -369,9 +372,9 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             if d > _MAX_EDGE or (d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= _TRAIL):
                 continue
             d1 = max(d, 1e-9)
-            if kind[u] == CORNER and not _tangent(dx / d1, dy / d1, ux, uy, shape[u]):
+            if kind[u] == CORNER and not _tangent(dx / d1, dy / d1, d, ux, uy, shape[u]):
                 continue
-            if kind[v] == CORNER and not _tangent(dx / d1, dy / d1, position[v, 0], position[v, 1], shape[v]):
+            if kind[v] == CORNER and not _tangent(dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape[v]):
                 continue
             want = min(need, relaxed[u], relaxed[v])
             if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
