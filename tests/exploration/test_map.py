@@ -86,9 +86,10 @@ def test_open_edges_are_the_boundary_of_the_union_less_the_walls(name, seed):
     for place in places:
         explorer.pose = np.array([*place, rng.uniform(-math.pi, math.pi)])
         explorer.look()
-        # Slivers of unknown thinner than the nudge do not count.
-        area = shapes.exploration_polygon(e).buffer(e.nudge, join_style="mitre").buffer(-e.nudge, join_style="mitre")
+        area = shapes.exploration_polygon(e)
         boundary = area.boundary
+        # Slivers of unknown as thin as the nudge may be closed already.
+        closed = area.buffer(e.nudge, join_style="mitre").buffer(-e.nudge, join_style="mitre").boundary
         walls = lines_of(explorer.walls)
         # Chords of range edges lie inside their arcs, and more so where they begin at a return just within range.
         arcs = e.kinds == scan_polygon.RANGE
@@ -96,9 +97,10 @@ def test_open_edges_are_the_boundary_of_the_union_less_the_walls(name, seed):
         near, far = e.nudge + 0.04, e.nudge + 0.11
         # What is kept lies on the boundary.
         assert not parts_longer_than(pieces.difference(boundary.buffer(near)), 0.1)
-        assert not parts_longer_than(chords.difference(boundary.buffer(far)), 0.1)
+        # (A chord too deep in its arc may outlive an arc that another scan covers, by less than a jump edge.)
+        assert not parts_longer_than(chords.difference(boundary.buffer(far)), e.min_gap)
         # What the boundary has is kept, but walls and crumbs.
-        wanted = boundary.difference(walls.buffer(e.cover + 0.01))
+        wanted = closed.difference(walls.buffer(e.cover + 0.01))
         missing = wanted.difference(pieces.buffer(near).union(chords.buffer(far)))
         assert not parts_longer_than(missing, 0.2), [p.wkt for p in parts_longer_than(missing, 0.2)]
         # The unknown is on the right.
@@ -107,7 +109,7 @@ def test_open_edges_are_the_boundary_of_the_union_less_the_walls(name, seed):
         size = np.hypot(*d.T)
         aside = (e.nudge + 0.001) * np.stack((d[:, 1], -d[:, 0]), axis=1) / size[:, None]
         beyond = 0.5 * (straight[:, :2] + straight[:, 2:]) + aside
-        inner = shapes.exploration_polygon(e).buffer(-0.002)
+        inner = area.buffer(-0.002)
         shapely.prepare(inner)
         assert not shapely.contains_xy(inner, beyond[size > 0.05]).any()
 
