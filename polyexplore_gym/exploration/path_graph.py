@@ -33,8 +33,9 @@ _NEIGHBOURHOOD = 0.25
 """Radius (m) of the circle around a wall end on which its corner is judged: raggedness below it is no corner."""
 _SPACING = 0.1
 """Two vertices nearer than this (m) are one."""
+_MAX_LEAF_EDGE = 15.0
 _MAX_EDGE = 10.0
-"""Longest edge of the graph, m."""
+"""Longest edges of the graph, to leaves and between corners, m."""
 _FLAT = 0.2
 """A corner that turns less than this (rad) beyond straight gets no vertex."""
 _ARC = math.pi / 4
@@ -44,7 +45,8 @@ _TRAIL = 8.0
 _TRAIL_EDGE = 0.6
 """Longest edge (m) from the way driven to anything else."""
 _WAY_POINT = 4.0
-"""Where no corner stands within this distance (m) of a scan, the scan's place becomes a vertex itself."""
+_CORNER_NEAR = 1.5
+"""A scan's place becomes a vertex where no other such place and no corner stands within these distances, m."""
 _SAME = 0.92
 """Cosine above which a wall leaves its end as it did when the corner was judged: the map breathes."""
 _LEEWAY = 0.15
@@ -366,10 +368,11 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
                 continue
             dx = position[v, 0] - ux
             dy = position[v, 1] - uy
-            if abs(dx) > _MAX_EDGE or abs(dy) > _MAX_EDGE:
+            limit = _MAX_LEAF_EDGE if kind[u] == LEAF or kind[v] == LEAF else _MAX_EDGE
+            if abs(dx) > limit or abs(dy) > limit:
                 continue
             d = math.hypot(dx, dy)
-            if d > _MAX_EDGE or (d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= _TRAIL):
+            if d > limit or (d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= _TRAIL):
                 continue
             d1 = max(d, 1e-9)
             if kind[u] == CORNER and not _tangent(dx / d1, dy / d1, d, ux, uy, shape[u]):
@@ -820,9 +823,12 @@ class PathGraph:
         return self._open
 
     def add_way_point(self, x: float, y: float) -> None:
-        """Make a place where the robot stood a vertex, if corners are far: halls have none in their middle."""
-        near = np.abs(self.position[: self.n_vertices] - (x, y)).max(axis=1) < _WAY_POINT
-        if not (near & (self.kind[: self.n_vertices] == CORNER)).any():
+        """Make a place where the robot stood a vertex, if others are far: halls have no corners in their middle."""
+        n = self.n_vertices
+        near = np.abs(self.position[:n] - (x, y)).max(axis=1)
+        corner = self.kind[:n] == CORNER
+        in_the_open = corner & (self.shape[:n, 6] >= _ANY)
+        if not (corner & (near < _CORNER_NEAR)).any() and not (in_the_open & (near < _WAY_POINT)).any():
             shape = np.array([[x + 1e6, y, 1.0, 0.0, 1.0, 0.0, _ANY]])
             self._fresh = np.concatenate((self._fresh, self._new_vertices(np.array([[x, y]]), shape)))
 

@@ -25,7 +25,7 @@ _BUMP = 0.02
 """A drive ends when a wall has taken this much of the commanded motion, m."""
 _ARRIVED = 0.05
 """A drive that ends farther than this (m) from the end of its path has not arrived."""
-_PENETRATION = 1e-3
+_PENETRATION = 2e-5
 """The disc never stands deeper than this in a wall, m."""
 _ROWS = 2048
 
