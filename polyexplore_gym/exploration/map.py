@@ -356,9 +356,7 @@ class ExplorationMap:
             g.set_sources(vertices, np.array([row_of.get(int(v), -1) for v in vertices], np.int64))
         g.repair()
         c.path_length[:] = math.inf
-        c.path_length[rows] = g.dist[:, self.robot] + sum(
-            math.dist(a, b) for a, b in itertools.pairwise(self._start)
-        )
+        c.path_length[rows] = g.dist[:, self.robot] + sum(math.dist(a, b) for a, b in itertools.pairwise(self._start))
 
     def _rows(self, chain: int) -> np.ndarray:
         return np.flatnonzero(self.owner == chain)
@@ -372,9 +370,7 @@ class ExplorationMap:
             sampled = c.length[i] / (config.samples * self.sensor.resolution)
             d = min(config.front_distance, sampled)
             x, y = mx - d * nx, my - d * ny
-        if nodes.stands(
-            x, y, mx, my, c.id[i], g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need
-        ):
+        if nodes.stands(x, y, mx, my, c.id[i], g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need):
             self._set_node(i, x, y, math.atan2(ny, nx))
 
     def _place_within(self, i: int, seen: np.ndarray) -> None:

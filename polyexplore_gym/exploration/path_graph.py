@@ -70,7 +70,7 @@ def _free_sector(ex, ey, walls, start, items):
     h = _NEIGHBOURHOOD
     angles = np.empty(64)
     n = 0
-    cell = (int(math.floor(ex)) * 73856093) ^ (int(math.floor(ey)) * 19349663)
+    cell = (math.floor(ex) * 73856093) ^ (math.floor(ey) * 19349663)
     b = cell & mask
     for e in range(start[b], start[b + 1]):
         i = items[e]
@@ -169,7 +169,7 @@ def corner_vertices(ends, walls, start, items, rho, need, known, waited, since):
         turn = 2.0 * math.pi if lone else gap - math.pi
         if turn < _FLAT:
             continue
-        parts = int(math.ceil(turn / _ARC - 1e-9))
+        parts = math.ceil(turn / _ARC - 1e-9)
         first = a if lone else a + 0.5 * math.pi
         last_plain = True
         for p in range(parts):
@@ -655,7 +655,7 @@ def retreat(x, y, walls, start, items, need):
     millimetres: sliding along the wall would bump again.
     """
     mask = start.size - 2
-    b = ((int(math.floor(x)) * 73856093) ^ (int(math.floor(y)) * 19349663)) & mask
+    b = ((math.floor(x) * 73856093) ^ (math.floor(y) * 19349663)) & mask
     for step in range(1, 11):
         d = 0.04 * step
         best = need
@@ -772,8 +772,8 @@ class PathGraph:
             self.position, self.kind, self.shape, self.n_vertices, walls[touched], walls, *self.wall_grid, self.need
         )
         killed = block_by_walls(
-            self.ends, self.state, self.wants, self.length, self.n_edges, self.position, self.kind, self.n_vertices, self.shape,
-            walls[rows], self.need,
+            self.ends, self.state, self.wants, self.length, self.n_edges, self.position, self.kind, self.n_vertices,
+            self.shape, walls[rows], self.need,
         )  # fmt: skip
         if killed.size:
             self._killed.append(killed)

@@ -94,9 +94,9 @@ def label_edges(angles, ranges, point_segment, max_range, sigma_range, sigma_ang
             gap = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(step), 0.0))
             if gap >= min_gap:
                 labels[k] = JUMP
-            elif (
-                point_segment[k] >= 0 and point_segment[k] == point_segment[j]
-            ) or _same_surface(ranges, k, step, sigma_range, sigma_angle, full):
+            elif (point_segment[k] >= 0 and point_segment[k] == point_segment[j]) or _same_surface(
+                ranges, k, step, sigma_range, sigma_angle, full
+            ):
                 labels[k] = WALL
             else:
                 labels[k] = JUMP
@@ -119,7 +119,7 @@ def open_edges(points, labels, max_range, piece_length, full):
         for side in range(2):
             x = points[0 if side == 0 else n - 1, 0]
             y = points[0 if side == 0 else n - 1, 1]
-            parts = int(math.ceil(math.hypot(x, y) / piece_length))
+            parts = math.ceil(math.hypot(x, y) / piece_length)
             for i in range(parts):
                 f0 = i / parts
                 f1 = (i + 1) / parts
@@ -147,7 +147,7 @@ def open_edges(points, labels, max_range, piece_length, full):
         y0 = points[k, 1]
         x1 = points[stop % n, 0]
         y1 = points[stop % n, 1]
-        parts = max(int(math.ceil(math.hypot(x1 - x0, y1 - y0) / piece_length)), 1)
+        parts = max(math.ceil(math.hypot(x1 - x0, y1 - y0) / piece_length), 1)
         for i in range(parts):
             if count == out.shape[0]:
                 break

@@ -87,10 +87,10 @@ def build_grid(segments, alive, margin):
             y1 = segments[i, 1]
             x2 = segments[i, 2]
             y2 = segments[i, 3]
-            ix0 = int(math.floor((min(x1, x2) - margin) / CELL))
-            ix1 = int(math.floor((max(x1, x2) + margin) / CELL))
-            iy0 = int(math.floor((min(y1, y2) - margin) / CELL))
-            iy1 = int(math.floor((max(y1, y2) + margin) / CELL))
+            ix0 = math.floor((min(x1, x2) - margin) / CELL)
+            ix1 = math.floor((max(x1, x2) + margin) / CELL)
+            iy0 = math.floor((min(y1, y2) - margin) / CELL)
+            iy1 = math.floor((max(y1, y2) + margin) / CELL)
             small = (ix1 - ix0 + 1) * (iy1 - iy0 + 1) <= 4
             for ix in range(ix0, ix1 + 1):
                 for iy in range(iy0, iy1 + 1):
@@ -112,7 +112,7 @@ def build_grid(segments, alive, margin):
 def clearance(px, py, segments, start, items, limit):
     """Distance from a point to the nearest segment, or `limit` if that is less (<= the grid's margin)."""
     mask = start.size - 2
-    b = bucket(int(math.floor(px / CELL)), int(math.floor(py / CELL)), mask)
+    b = bucket(math.floor(px / CELL), math.floor(py / CELL), mask)
     best = limit
     for e in range(start[b], start[b + 1]):
         i = items[e]
@@ -125,10 +125,10 @@ def clearance(px, py, segments, start, items, limit):
 def sweep_free(ax, ay, bx, by, segments, start, items, radius):
     """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
     mask = start.size - 2
-    ix = int(math.floor(ax / CELL))
-    iy = int(math.floor(ay / CELL))
-    jx = int(math.floor(bx / CELL))
-    jy = int(math.floor(by / CELL))
+    ix = math.floor(ax / CELL)
+    iy = math.floor(ay / CELL)
+    jx = math.floor(bx / CELL)
+    jy = math.floor(by / CELL)
     dx = bx - ax
     dy = by - ay
     sx = 1 if dx > 0 else -1
@@ -171,10 +171,10 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
 def crossing_free(ax, ay, bx, by, segments, start, items, owner, own_a, own_b, slack_a, slack_b):
     """Whether a-b crosses no segment, but within `slack_a` m of a, `slack_b` m of b, or those of its owners."""
     mask = start.size - 2
-    ix = int(math.floor(ax / CELL))
-    iy = int(math.floor(ay / CELL))
-    jx = int(math.floor(bx / CELL))
-    jy = int(math.floor(by / CELL))
+    ix = math.floor(ax / CELL)
+    iy = math.floor(ay / CELL)
+    jx = math.floor(bx / CELL)
+    jy = math.floor(by / CELL)
     dx = bx - ax
     dy = by - ay
     length = math.hypot(dx, dy)
