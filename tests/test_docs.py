@@ -1,0 +1,168 @@
+"""What the documents say is true: their code runs, their commands parse, their tables are complete."""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from polyexplore_gym import __version__, cli
+from polyexplore_gym.config import EnvConfig, RewardConfig, to_mapping
+from polyexplore_gym.env import PolyExploreEnv
+from polyexplore_gym.floorplan import suite
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BENCHMARKS = (ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    """The README's fenced blocks of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
+
+
+PYTHON = blocks("python")
+COMMANDS = [line for block in blocks("sh") for line in block.splitlines() if "polyexplore " in line]
+
+
+def arguments(command: str) -> list[str]:
+    """Of a `polyexplore` command line, which may set variables first."""
+    words = shlex.split(command)
+    return words[words.index("polyexplore") + 1 :]
+
+
+def rows(head: str, text: str = README) -> list[list[str]]:
+    """The cells of the table whose first column has this head."""
+    table = re.search(rf"^\| {re.escape(head)} \|.*\n\|[-| ]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert table is not None, head
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table[1].splitlines()]
+
+
+def names(head: str, text: str = README) -> list[str]:
+    return [row[0].strip("| `") for row in rows(head, text)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Where a reader would be: the README's own modules and plans, and docs/ beside them."""
+    folder = tmp_path_factory.mktemp("reader")
+    shutil.copytree(ROOT / "docs", folder / "docs")
+    for code in PYTHON:
+        if name := re.match(r"# (\w+\.py)\n", code):
+            (folder / name[1]).write_text(code, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def reader(folder, monkeypatch) -> Path:
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("code", PYTHON, ids=lambda code: re.sub(r"\W+", "-", code[-40:]).strip("-"))
+def test_python_runs(code, reader, tmp_path):
+    if "sb3_contrib" in code:
+        pytest.importorskip("sb3_contrib")
+    script = tmp_path / "block.py"
+    script.write_text(code, encoding="utf-8")
+    assert runpy.run_path(str(script))
+
+
+def test_the_first_loop_is_short_and_ends():
+    loop = PYTHON[0].strip().splitlines()
+    assert len(loop) <= 12
+    assert "action_mask" in PYTHON[0]
+    assert "node_path_length" in PYTHON[0]
+
+
+def test_there_is_something_to_test():
+    assert len(PYTHON) >= 6
+    assert {arguments(command)[0] for command in COMMANDS} == set(cli._COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_parse(command, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(cli, "_COMMANDS", {name: (kind, parsed.append) for name, (kind, _) in cli._COMMANDS.items()})
+    cli.main(arguments(command))
+    assert len(parsed) == 1
+
+
+def test_commands_run_in_order(reader, capsys):
+    """All but the default comparison, which takes minutes."""
+    save = next(code for code in PYTHON if "save_plan(" in code)
+    exec(compile(save, "README", "exec"), {})
+    ran = 0
+    for command in COMMANDS:
+        words = arguments(command)
+        if words[0] == "bench" and not {"--suite", "--plans"} & set(words):
+            continue
+        extra = ["--workers", "1", "--no-plots", "--drive", "kinematic"] if words[0] == "bench" else []
+        capsys.readouterr()
+        assert cli.main([*words, *extra]) == 0, command
+        assert ("distance" if words[0] == "run" else "IQM") in capsys.readouterr().out
+        for option in ("--png", "--out"):
+            if option in words:
+                assert Path(words[words.index(option) + 1]).exists()
+        ran += 1
+    assert ran >= 4
+
+
+def test_a_policy_in_the_working_folder_is_found(folder):
+    """With the variable that the README sets, by the command as installed."""
+    command = next(c for c in COMMANDS if c.startswith("PYTHONPATH=. polyexplore run"))
+    words = arguments(command)
+    policy = words[words.index("--policy") + 1]
+    code = f"from polyexplore_gym.evaluation import load_policy; load_policy({policy!r})"
+    env = {**os.environ, "PYTHONPATH": ".", "PYTHONSAFEPATH": "1"}
+    subprocess.run([sys.executable, "-c", code], cwd=folder, env=env, check=True)
+
+
+def test_the_tables_name_every_key():
+    env = PolyExploreEnv(plan=suite("home-validation").plan(0), config={"drive": {"mode": "kinematic"}})
+    _, info = env.reset(seed=0)
+    shapes = {row[0].strip("| `"): row[1] for row in rows("key")}
+    assert shapes == {key: str(box.shape) for key, box in env.observation_space.spaces.items()}
+    assert sorted(names("`info` key")) == sorted(info)
+    assert sorted(names("reward term")) == sorted(info["rewards"])
+    scales = {row[0].strip("| `"): float(row[1]) for row in rows("reward term")}
+    assert scales == to_mapping(RewardConfig())
+    assert f"`Discrete({env.action_space.n})`" in README
+    assert f"`max_decisions` ({EnvConfig().max_decisions})" in README
+    assert set(names("criterion")) == set(cli.SCRIPTED)
+
+
+def test_environments_are_listed():
+    import gymnasium
+
+    registered = {name for name in gymnasium.registry if name.startswith("PolyExplore-")}
+    assert set(names("environment")) == registered
+
+
+def test_named_files_and_targets_exist():
+    for path in re.findall(r"\]\(([^)#]+)\)", README) + re.findall(r"`((?:\w+/)+[\w.]+\.\w+)`", README):
+        assert (ROOT / path).exists() or path.startswith("results/"), path
+    for script in re.findall(r"python (\w+/\w+\.py)", README):
+        assert (ROOT / script).exists(), script
+    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"`make (\w+)`", README)) <= set(targets)
+    assert (ROOT / "docs" / "exploration.png").stat().st_size < 250_000
+
+
+def test_the_benchmarks_are_listed():
+    listed = names("script", BENCHMARKS)
+    assert sorted(listed) == sorted(path.name for path in (ROOT / "benchmarks").glob("*.py"))
+    for row in rows("script", BENCHMARKS):
+        assert f"python benchmarks/{row[0].strip('| `')}" in row[2]
+
+
+def test_the_changelog_has_this_version():
+    assert re.search(rf"^## {re.escape(__version__)}\b", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
