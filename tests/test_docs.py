@@ -71,6 +71,8 @@ def reader(folder, monkeypatch) -> Path:
 def test_python_runs(code, reader, tmp_path):
     if "sb3_contrib" in code:
         pytest.importorskip("sb3_contrib")
+        # Spinning threads take many times longer when tests run side by side.
+        pytest.importorskip("torch").set_num_threads(1)
     script = tmp_path / "block.py"
     script.write_text(code, encoding="utf-8")
     assert runpy.run_path(str(script))
