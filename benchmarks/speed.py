@@ -137,7 +137,8 @@ def plans_of(shared: tuple[str, ...], generated: tuple[str, ...], folder: Path) 
 
 def rates(repetitions: int, folder: Path) -> dict[tuple[str, str], list[Played]]:
     """Print decisions a second for every plan; returns the episodes by size and mode."""
-    rows, episodes = [], defaultdict(list)
+    rows: list[list[str]] = []
+    episodes: dict[tuple[str, str], list[Played]] = defaultdict(list)
     for shared, generated in SIZES:
         plans = plans_of(shared, generated, folder)
         size = f"{statistics.mean(len(plan.segments) for plan in plans):.0f} walls"
