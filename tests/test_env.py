@@ -612,7 +612,8 @@ def test_whole_episodes_of_every_kind(name):
         *_, (_, _, _, info, _) = play(env, seed=seed)
         if "max_decisions" not in VARIATIONS[name]:
             assert not env.action_masks().any()
-            assert info["coverage"] > 0.9
+            # Drift without correction distorts the map: parts of the plan are lost.
+            assert info["coverage"] > (0.5 if "odometry" in name else 0.9)
 
 
 @pytest.mark.parametrize("family", ["home", "office", "angled"])

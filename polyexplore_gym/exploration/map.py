@@ -322,6 +322,12 @@ class ExplorationMap:
             for i in lost:
                 self._place_within(int(i), seen)
             self._update_sources()
+        if len(c) and not np.isfinite(c.path_length).any():
+            # What is left lies behind slivers of the unknown: look at it across them.
+            seen = g.reachable(self.robot)
+            for i in range(len(c)):
+                self._place_within(i, seen, through_unknown=True)
+            self._update_sources()
         which = np.flatnonzero(local)
         nodes.gains(
             which, c.node, c.vertex >= 0, c.middle, c.ends, c.id, np.ones(len(c), np.bool_), self.sensor.max_range,
@@ -373,12 +379,13 @@ class ExplorationMap:
         if nodes.stands(x, y, mx, my, c.id[i], g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need):
             self._set_node(i, x, y, math.atan2(ny, nx))
 
-    def _place_within(self, i: int, seen: np.ndarray) -> None:
+    def _place_within(self, i: int, seen: np.ndarray, through_unknown: bool = False) -> None:
         """Put the node at the reachable place nearest to its jump edge that sees it, or mask it."""
         g, c = self.graph, self.chains
         x, y, heading, found = nodes.nearest_reachable(
             self._rows(int(c.id[i])), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
             self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
+            through_unknown,
         )  # fmt: skip
         if found:
             self._drop_vertices(c.vertex[i : i + 1])

@@ -76,12 +76,14 @@ def _joins(x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p
 
 @njit(cache=True)
 def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_range, walls, w_start, w_items,
-                      pieces, p_start, p_items, owner, need, slack):  # fmt: skip
+                      pieces, p_start, p_items, owner, need, slack, through_unknown):  # fmt: skip
     """The reachable place nearest to a jump edge from which it is visible: (x, y, heading, found).
 
-    Tries places before the edge on its known side, then the vertices of the graph in `seen`. The
-    heading looks at the edge.
+    Tries places before the edge on its known side, then the vertices of the graph in `seen`; with
+    `through_unknown` also those between which and the edge there are no known walls but other jump
+    edges. The heading looks at the edge.
     """
+    no_owner = np.full(walls.shape[0], -1, np.int64)
     for offset in _OFFSETS:
         for fraction in _FRACTIONS:
             px, py = point_along(rows, pieces, fraction)
@@ -102,11 +104,19 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
         if not seen[v] or kind[v] < 0:
             continue
         d = math.hypot(mx - position[v, 0], my - position[v, 1])
-        # Only from the known side is the edge a window into the unknown.
-        if d < best and (mx - position[v, 0]) * nx + (my - position[v, 1]) * ny > 0.1 * d and sees(
-            position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain,
-            chain,
-        ):  # fmt: skip
+        if d >= best:
+            continue
+        if through_unknown:
+            visible = crossing_free(
+                position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT
+            )
+        else:
+            # Only from the known side is the edge a window into the unknown.
+            visible = (mx - position[v, 0]) * nx + (my - position[v, 1]) * ny > 0.1 * d and sees(
+                position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner,
+                chain, chain,
+            )  # fmt: skip
+        if visible:
             best = d
             bx = position[v, 0]
             by = position[v, 1]
