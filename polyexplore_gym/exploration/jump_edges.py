@@ -263,18 +263,19 @@ def rechain(pieces, kinds, visits, done, owner, dirty, local, kept, origin, fres
         if dirty[i] and owner[i] >= 0:
             lost[owner[i]] = True
     at = 0
-    for i in range(m):
+    k = 0
+    for i in range(m):  # in the old order: the pieces of a chain stay in theirs
         if away[i]:
             p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
                 pieces[i], kinds[i], visits[i], done[i], owner[i], dirty[i],
             )  # fmt: skip
             at += 1
-    for k in range(kept.shape[0]):
-        i = local[origin[k]]
-        p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
-            kept[k], kinds[i], visits[i], done[i] or seen_from[k], owner[i], dirty[i],
-        )  # fmt: skip
-        at += 1
+        while k < kept.shape[0] and local[origin[k]] == i:
+            p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
+                kept[k], kinds[i], visits[i], done[i] or seen_from[k], owner[i], dirty[i],
+            )  # fmt: skip
+            at += 1
+            k += 1
     for k in range(fresh.shape[0]):
         p[at] = fresh[k]
         kind[at] = fresh_kinds[k]
