@@ -311,7 +311,7 @@ class ExplorationMap:
         self._update_sources()
         if came is not None:
             self._trail.append(came)
-        if len(c) and not np.isfinite(c.path_length).any() and self._trail and g.is_cut_off(self.robot):
+        if len(c) and not np.isfinite(c.path_length).any() and self._trail:
             g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
             self._trail = []
             self._update_sources()

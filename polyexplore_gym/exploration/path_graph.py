@@ -971,11 +971,6 @@ class PathGraph:
             points.append(self.position[v])
         return np.array(points)
 
-    def is_cut_off(self, root: int) -> bool:
-        """Whether no path leads from `root` to most of the corners, as where a tight place was entered."""
-        corners = self.kind[: self.n_vertices] == CORNER
-        return bool(self.reachable(root)[corners].sum() < 0.5 * corners.sum())
-
     def reachable(self, root: int) -> np.ndarray:
         """Which vertices (n_vertices,) an open path joins to `root`."""
         first, target, _ = self.open_edges()

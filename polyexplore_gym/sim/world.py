@@ -19,7 +19,7 @@ _PATH_START = 1e-3
 _SHORTEST_LEG = 1e-4
 _MARGIN = 0.75
 """Walls this far (m) beyond the robot's rim from the path take part in a drive; the follower gives up before."""
-_SUBSTEP = 0.02
+_SUBSTEP = 0.001
 """In contact the robot moves at most this share of its radius in a step of the engine."""
 _BUMP = 0.02
 """A drive ends when a wall has taken this much of the commanded motion, m."""
