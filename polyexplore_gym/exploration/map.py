@@ -23,6 +23,8 @@ _SLACK = 0.3
 """Paths may cross an open edge this near (m) to the node or robot at their end."""
 _TRAIL_STEP = 0.3
 """Spacing of the way points on a way driven, m."""
+_AT_NODE = 0.75
+"""A jump edge counts as measured from its node only within this distance (m) of where that should be."""
 _SPARE = 0.05
 """Paths round corners keep this much more than the robot's radius, m."""
 
@@ -188,6 +190,10 @@ class ExplorationMap:
         dirty = np.zeros(len(self.pieces), np.bool_)
         dirty[local[changed]] = True
         if target is not None:
+            row = np.flatnonzero(self.chains.id == target)
+            near = self.config.front_distance if self.config.placement == "in_front" else 0.0
+            if len(row) and math.dist(self.chains.middle[row[0]], (x, y)) > near + _AT_NODE:
+                arrived = False  # a look from afar is an attempt, not a measurement from its node
             mine = self.owner == target
             self.visits[mine] += 1
             dirty |= mine

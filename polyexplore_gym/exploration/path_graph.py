@@ -51,7 +51,9 @@ _SAME = 0.92
 """Cosine above which a wall leaves its end as it did when the corner was judged: the map breathes."""
 _LEEWAY = 0.15
 """Sine by which a path through a corner vertex may miss being taut: the map is noisy."""
-_SHORT = 0.6
+_APART = 0.03
+"""Wall ends farther apart than this (m) are two; nearer ones are one end seen twice."""
+_SHORT = 0.7
 """Legs up to this length (m) need not be taut."""
 _FREE = 2.0
 """Stands for the largest sine where a vertex serves every direction past its corner."""
@@ -280,6 +282,9 @@ def _absorb(x, y, form, px, py, shape):
     """
     if math.hypot(px - x, py - y) > _SPACING:
         return False
+    # One that stands nearer to the candidate's own corner would let taut paths scrape it.
+    if math.hypot(px - form[0], py - form[1]) < math.hypot(x - form[0], y - form[1]) - 0.01:
+        return False
     rx = x - form[0]
     ry = y - form[1]
     qx = px - shape[0]
@@ -292,6 +297,10 @@ def _absorb(x, y, form, px, py, shape):
             shape[k] = 0.0
             shape[k + 1] = 0.0
             shape[6] = _FREE
+    if math.hypot(shape[0] - form[0], shape[1] - form[1]) > _APART:
+        # It now serves two wall ends.
+        shape[2:6] = 0.0
+        shape[6] = max(shape[6], _FREE)
     shape[6] = max(shape[6], form[6])
     return True
 
@@ -316,7 +325,7 @@ def distinct(candidates, forms, position, shape, kind, n_vertices):
             if keep[i] and keep[j] and _absorb(x, y, forms[i], candidates[j, 0], candidates[j, 1], forms[j]):
                 keep[i] = False
                 apart = math.hypot(forms[i, 0] - forms[j, 0], forms[i, 1] - forms[j, 1])
-        if apart > 0.03:
+        if apart > _APART:
             # Its neighbours round the corner now turn to a vertex that stands a little elsewhere.
             for j in (i - 1, i + 1):
                 if 0 <= j < m and forms[j, 0] == forms[i, 0] and forms[j, 1] == forms[i, 1]:
