@@ -331,8 +331,8 @@ class ExplorationMap:
         if len(c) and not np.isfinite(c.path_length).any():
             # What is left lies behind slivers of the unknown: look at it across them.
             seen = g.reachable(self.robot)
-            for i in range(len(c)):
-                self._place_within(i, seen, through_unknown=True)
+            for row in range(len(c)):
+                self._place_within(row, seen, through_unknown=True)
             self._update_sources()
         which = np.flatnonzero(local)
         nodes.gains(
