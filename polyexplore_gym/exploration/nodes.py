@@ -12,6 +12,8 @@ from polyexplore_gym.exploration.segments import clearance, crossing_free, sweep
 
 _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
 _OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0])
+_ASIDE = 0.15
+"""Distance (m) from a jump edge of the point that must be visible."""
 _SIGHT = 0.05
 """A line of sight may end within this distance (m) of its target's own walls."""
 
@@ -85,6 +87,8 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
     """
     no_owner = np.full(walls.shape[0], -1, np.int64)
     for offset in _OFFSETS:
+        if through_unknown:
+            break  # places before the edge were tried, and no path led there
         for fraction in _FRACTIONS:
             px, py = point_along(rows, pieces, fraction)
             x = px - offset * nx
@@ -96,6 +100,9 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
                 slack,
             ):  # fmt: skip
                 return x, y, math.atan2(ny, nx), True
+    # A jump edge begins at the corner that hides what is behind it: aim beside it, on its known side.
+    tx = mx - _ASIDE * nx
+    ty = my - _ASIDE * ny
     best = 0.8 * max_range
     bx = 0.0
     by = 0.0
@@ -108,12 +115,12 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
             continue
         if through_unknown:
             visible = crossing_free(
-                position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT
+                position[v, 0], position[v, 1], tx, ty, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT
             )
         else:
             # Only from the known side is the edge a window into the unknown.
             visible = (mx - position[v, 0]) * nx + (my - position[v, 1]) * ny > 0.1 * d and sees(
-                position[v, 0], position[v, 1], mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner,
+                position[v, 0], position[v, 1], tx, ty, walls, w_start, w_items, pieces, p_start, p_items, owner,
                 chain, chain,
             )  # fmt: skip
         if visible:
