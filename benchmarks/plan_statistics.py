@@ -52,7 +52,7 @@ def raster(plan: FloorPlan) -> np.ndarray:
     return image
 
 
-@numba.njit(cache=True)
+@numba.njit
 def flood(
     distance: np.ndarray, order: np.ndarray, contrast: float, prominence: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
