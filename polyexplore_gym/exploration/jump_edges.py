@@ -403,7 +403,7 @@ def link(pieces, tolerance, shortest, longest):
 
 @njit(cache=True)
 def summarise(pieces, kinds, visits, order, offsets):
-    """Per chain: (c, 8) length, middle x y, normal x y into the unknown, and (c, 4) its ends; kind; visits."""
+    """Per chain: (c, 5) length, middle x y, normal x y into the unknown; (c, 4) its ends; kind; visits."""
     c = offsets.size - 1
     data = np.empty((c, 5))
     ends = np.empty((c, 4))
