@@ -133,6 +133,8 @@ class MappingConfig:
 
     start: Literal["endpoint", "hough"] = "endpoint"
     """Initial guess of the lines: iterative end-point fit, or the probabilistic Hough transform."""
+    grouping: bool = True
+    """Make one of the lines of a scan that lie on one wall; False: keep all that the start finds (for comparison)."""
     min_points: int = 6
     """Fewest returns on a line."""
     min_length: float = 0.25

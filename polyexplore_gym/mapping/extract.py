@@ -92,7 +92,7 @@ def extract_lines(
     noise = sigma_range**2, sigma_angle**2
     limits = config.min_points, config.min_length
     if config.start == "hough":
-        label, count = hough_labels(x, y, *noise, *limits, config.door_width)
+        label, count = hough_labels(x, y, *noise, *limits, config.door_width, config.grouping)
     else:
         label, count = endpoint_labels(x, y, beam_of, resolution, *noise, *limits)
     if sensor.full_circle and count > 0:
@@ -100,7 +100,7 @@ def extract_lines(
     return ScanLines(
         *_assemble(
             x, y, beam_of, reach_of, cos_t, sin_t, start, sensor.max_range, resolution, label, count,
-            sigma_range, sigma_angle, config.door_width, config.min_points, config.min_length,
+            sigma_range, sigma_angle, config.door_width, config.min_points, config.min_length, config.grouping,
         )
     )  # fmt: skip
 
@@ -202,13 +202,15 @@ def _assemble(
     reach: float,
     min_points: int,
     min_length: float,
+    grouping: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Labelled returns to the fields of `ScanLines`."""
     var_range, var_angle = sigma_range * sigma_range, sigma_angle * sigma_angle
     fits = fit_labels(x, y, label, count, var_range, var_angle)
-    group_collinear(x, y, label, fits, var_range, var_angle, COLLINEAR_GATE)
-    attach(x, y, label, fits, var_range, var_angle, reach)
-    fits = fit_labels(x, y, label, count, var_range, var_angle)
+    if grouping:
+        group_collinear(x, y, label, fits, var_range, var_angle, COLLINEAR_GATE)
+        attach(x, y, label, fits, var_range, var_angle, reach)
+        fits = fit_labels(x, y, label, count, var_range, var_angle)
     where, segments, owner = cut(
         x, y, beam, ranges, cos_t, sin_t, max_range, resolution, label, fits,
         sigma_range, sigma_angle, reach, min_points, min_length,

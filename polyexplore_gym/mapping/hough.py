@@ -32,8 +32,12 @@ def hough_labels(
     min_points: int,
     min_length: float,
     reach: float,
+    grouping: bool = True,
 ) -> tuple[np.ndarray, int]:
-    """(m,) label of the line each return lies on (-1 none) and the number of lines."""
+    """(m,) label of the line each return lies on (-1 none) and the number of lines.
+
+    Without grouping each line of the transform keeps the returns whose pixels it passed.
+    """
     from cv2 import HoughLinesP  # heavy, and needed by this start alone
 
     label = np.full(x.size, -1, np.int64)
@@ -54,6 +58,8 @@ def hough_labels(
         if found is None:
             break
         ends = (found.reshape(-1, 4) + 0.5) * RASTER + np.array([x0, y0, x0, y0])
+        if not grouping:
+            return label, take_each(x, y, ends, label, min_points)
         before = count
         count = take_dominant(x, y, ends, label, count, var_range, var_angle, min_points, min_length, reach)
         if count == before:
@@ -84,6 +90,18 @@ def beside(
                 out[n] = k
                 n += 1
     return out[:n]
+
+
+@njit(cache=True)
+def take_each(x: np.ndarray, y: np.ndarray, ends: np.ndarray, label: np.ndarray, min_points: int) -> int:
+    """Label the free returns within a pixel of each line, in the order found; returns the number of labels."""
+    count = 0
+    for i in range(ends.shape[0]):
+        index = beside(x, y, label, ends[i], 0.0, 0.0)
+        if index.size >= min_points:
+            label[index] = count
+            count += 1
+    return count
 
 
 @njit(cache=True)

@@ -77,7 +77,7 @@ class LineMap:
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self.config.door_width,
-            self._rows, self._lines, self._grid, slots,
+            self.config.grouping, self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
         touched = np.sort(slots.touched[: slots.counts[3]])
         if touched.size:

@@ -299,12 +299,16 @@ def insert(
     var_angle: float,
     gate: float,
     door: float,
+    grouping: bool,
     rows: Rows,
     lines: Lines,
     grid: Grid,
     slots: Slots,
 ) -> None:
-    """Insert one scan's lines and fragments; the touched rows are left in `slots`."""
+    """Insert one scan's lines and fragments; the touched rows are left in `slots`.
+
+    Without grouping the lines are taken one by one, as if each came from a scan of its own.
+    """
     slots.counts[2] += 1
     slots.counts[3] = 0
     stamp = slots.counts[2]
@@ -330,9 +334,9 @@ def insert(
             placed[k, 4 + e] = max(v, LEAST_END**2)
 
     # new lines that meet the same map line share this scan's pose error: merge them in the scan's frame first
-    best = np.full(n, -1, np.int64)
+    best = np.full(n, -1 if grouping else 0, np.int64)
     score = np.full(n, math.inf)
-    for i in range(n):
+    for i in range(n if grouping else 0):
         r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
         count, d2 = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, found, match)
         if count == 0:
