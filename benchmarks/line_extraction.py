@@ -11,15 +11,27 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from typing import Literal
 
 import numpy as np
 import shapely
+from standard_hough import candidates_counted
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
+from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
+from polyexplore_gym.mapping.hough import VOTES
 from polyexplore_gym.sim.laser import cast_rays
 
 ANGLES = np.linspace(-math.pi / 2, math.pi / 2, 361)
+STARTS: dict[str, tuple[Literal["endpoint", "hough"], int | None]] = {
+    "end points": ("endpoint", None),
+    "probabilistic Hough": ("hough", None),
+    f"standard Hough, {VOTES} votes": ("hough", VOTES),
+    "standard Hough, 8 votes": ("hough", 8),
+    "standard Hough, 20 votes": ("hough", 20),
+}
+"""Start of the lines, and votes of the standard transform if it takes the place of the probabilistic one."""
 
 
 def office(rng: np.random.Generator) -> tuple[np.ndarray, shapely.Polygon]:
@@ -80,7 +92,7 @@ def visible(walls: np.ndarray, exact: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Seen piece of each wall (M, 4), and the number of beams on it."""
     seen, beams = walls.copy(), np.zeros(len(walls), int)
     hit = np.isfinite(exact)
-    points = np.c_[exact * np.cos(ANGLES), exact * np.sin(ANGLES)][hit]
+    points = np.c_[exact[hit] * np.cos(ANGLES[hit]), exact[hit] * np.sin(ANGLES[hit])]
     for i, w in enumerate(walls):
         u = w[2:] - w[:2]
         length = math.hypot(*u)
@@ -139,20 +151,54 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    header = ("noise", "start", "recall", "precision", "of all", "segments", "candidates", "ms a scan", "times")
+    rows: list[tuple[str, ...]] = []
     for sigma_range, degrees in ((0.01, 0.1), (0.02, 0.2), (0.05, 0.5)):
         sensor = SensorConfig(sigma_range=sigma_range, sigma_angle=math.radians(degrees))
         sample = scans(arguments.scans, sensor, np.random.default_rng(arguments.seed))
-        for start in ("endpoint", "hough"):
-            config = MappingConfig(start=start)
-            extract_lines(ANGLES, sample[0][2], sensor, config)
-            times, found = [], []
-            for _, _, ranges in sample:
-                begin = time.perf_counter()
-                found.append(extract_lines(ANGLES, ranges, sensor, config))
-                times.append(time.perf_counter() - begin)
-            result = "  ".join(f"{k} {v:.4f}" if v <= 1 else f"{k} {v}" for k, v in score(sample, found).items())
-            print(f"{sigma_range} m {degrees} deg  {start:8s}  {result}  {1e3 * np.median(times):.3f} ms a scan")
+        found, cost, candidates = extract_all(sample, sensor)
+        for name in STARTS:
+            result = score(sample, found[name])
+            rows.append(
+                (
+                    f"{sigma_range} m, {degrees} deg",
+                    name,
+                    *(f"{result[key]:.4f}" for key in ("recall", "precision", "precision of all")),
+                    f"{result['segments']}",
+                    f"{candidates[name]:.1f}" if candidates[name] else "-",
+                    f"{1e3 * cost[name]:.3f}",
+                    f"{cost[name] / cost['end points']:.2f}",
+                )
+            )
+    print(f"{arguments.scans} scans, {result['walls']} walls at the last noise")
+    print(format_table(header, rows))
+    print("candidates: lines of the first search of a scan, mean; times: cost over that of the start 'end points'")
     print(f"insert into a map of 5,000 lines: {1e3 * insert_time(np.random.default_rng(0)):.3f} ms a scan")
+
+
+def extract_all(
+    sample: list, sensor: SensorConfig
+) -> tuple[dict[str, list[ScanLines]], dict[str, float], dict[str, float]]:
+    """By start: lines of each scan, median seconds a scan, mean number of candidate lines. Starts take turns."""
+    found: dict[str, list[ScanLines]] = {name: [] for name in STARTS}
+    times: dict[str, list[float]] = {name: [] for name in STARTS}
+    candidates: dict[str, list[int]] = {name: [] for name in STARTS}
+    for k, (_, _, ranges) in enumerate([sample[0], *sample]):  # the first is scanned twice: it also compiles
+        for name, (start, votes) in STARTS.items():
+            config = MappingConfig(start=start)
+            with candidates_counted(votes) as searches:
+                begin = time.perf_counter()
+                lines = extract_lines(ANGLES, ranges, sensor, config)
+                seconds = time.perf_counter() - begin
+            if k:
+                found[name].append(lines)
+                times[name].append(seconds)
+                candidates[name].append(searches[0] if searches else 0)
+    return (
+        found,
+        {name: float(np.median(values)) for name, values in times.items()},
+        {name: float(np.mean(values)) for name, values in candidates.items()},
+    )
 
 
 def insert_time(rng: np.random.Generator, blocks: int = 40) -> float:
