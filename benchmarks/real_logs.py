@@ -1,12 +1,15 @@
-"""The line map of real CARMEN laser logs: compression, distance of the points to their lines, cost.
+"""The line map of real laser logs: compression, distance of the points to their lines, doorways, cost.
 
-Run: python benchmarks/real_logs.py LOG.gz [LOG.gz ...] [--picture DIRECTORY]
+Run: python benchmarks/real_logs.py LOG [LOG ...] [--pictures FOLDER]
+
+`polyexplore linemap` makes the same maps. Here every map is made twice, without and with the check of all beams against
+all walls, and held against the raw beams once more, more plainly: a stretch of a segment counts as open where more than
+three beams pass by more than 20 cm for each return within 10 cm of it, counted on pieces of 5 cm.
 """
 
 from __future__ import annotations
 
 import argparse
-import gzip
 import math
 import time
 from pathlib import Path
@@ -14,105 +17,101 @@ from pathlib import Path
 import numpy as np
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
-from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
+from polyexplore_gym.evaluation.tables import format_table
+from polyexplore_gym.mapping import LaserLog, LineMap, LogMap, extract_lines, map_log, read_log, save_map, sensor_of
+
+STEP = 0.05
+"""Length of the pieces of a segment on which beams are counted, m."""
+DOOR = 0.5
+"""Shortest open stretch of interest, m."""
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Beam angles (n,), ranges (scans, n) and laser poses (scans, 3) of the FLASER records of a log."""
-    ranges, poses = [], []
-    with gzip.open(path, "rt") as log:
-        for record in log:
-            fields = record.split()
-            if fields and fields[0] == "FLASER":
-                n = int(fields[1])
-                ranges.append([float(v) for v in fields[2 : 2 + n]])
-                poses.append([float(v) for v in fields[2 + n : 5 + n]])
-    n = len(ranges[0])
-    angles = -math.pi / 2 + np.arange(n) * math.pi / (n - 1 if n % 2 else n)
-    table = np.array(ranges)
-    return angles, np.where(table > 0, table, np.inf), np.array(poses)
+    """Beam angles (n,), ranges (scans, n) and laser poses (scans, 3) of a log."""
+    log = read_log(path)
+    return log.angles, log.ranges, log.poses
 
 
-def point_distances(lines: ScanLines, angles: np.ndarray, ranges: np.ndarray) -> np.ndarray:
-    """Distance of each return on a line to its line, m."""
-    on = np.flatnonzero(lines.point_segment >= 0)
-    line = lines.segment_line[lines.point_segment[on]]
-    return np.abs(ranges[on] * np.cos(lines.alpha[line] - angles[on]) - lines.rho[line])
-
-
-def crossed(line_map: LineMap, angles: np.ndarray, ranges: np.ndarray, pose: np.ndarray, depth: float) -> np.ndarray:
-    """(M,) number of beams that pass through each row and on by more than `depth`, well inside its ends, m."""
-    s = line_map.segments
-    count = np.zeros(len(s), int)
-    near = line_map.alive & (np.hypot(s[:, 0] - pose[0], s[:, 1] - pose[1]) < 20)
-    for row in np.flatnonzero(near):
-        ax, ay, bx, by = s[row] - np.tile(pose[:2], 2)
-        length = math.hypot(bx - ax, by - ay)
-        if length < 0.3:
-            continue
-        c, q = np.cos(angles + pose[2]), np.sin(angles + pose[2])
-        cross = c * (by - ay) - q * (bx - ax)
+def open_stretches(made: LogMap, log: LaserLog, max_range: float) -> list[float]:
+    """Lengths of the stretches of segments that beams pass, m, longest first."""
+    turned = (log.poses[:, 2:] + log.angles).ravel()
+    ray = np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    origin = np.repeat(log.poses[:, :2], log.angles.size, axis=0)
+    reach = np.minimum(log.ranges, max_range).ravel()
+    end = origin + reach[:, None] * ray
+    returned = reach < max_range
+    found = []
+    for segment in made.segments:
+        first, length = segment[:2], math.dist(segment[:2], segment[2:])
+        along = (segment[2:] - first) / length
+        normal = np.array([-along[1], along[0]])
+        pieces = max(1, math.ceil(length / STEP))
+        before, behind = (origin - first) @ normal, (end - first) @ normal
+        slope = ray @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
-            r = (ax * (by - ay) - ay * (bx - ax)) / cross
-            t = (ax * q - ay * c) / cross * length
-        through = (r > 0) & (t > 0.15) & (t < length - 0.15) & ((ranges - r) * np.abs(cross) / length > depth)
-        count[row] = through.sum()
-    return count
+            met = (origin + (-before / slope)[:, None] * ray - first) @ along
+        through = (before * behind < 0) & (np.abs(behind) > 0.2) & (np.abs(slope) > 0.17) & (met >= 0) & (met < length)
+        at = (end - first) @ along
+        on = returned & (np.abs(behind) < 0.1) & (at >= 0) & (at < length)
+        passed = np.bincount((met[through] / length * pieces).astype(int), minlength=pieces)
+        stopped = np.bincount((at[on] / length * pieces).astype(int), minlength=pieces)
+        edges = np.flatnonzero(np.diff((passed > 3 * stopped).astype(int), prepend=0, append=0)).reshape(-1, 2)
+        found += [float(b - a) * length / pieces for a, b in edges]
+    return sorted((f for f in found if f >= DOOR), reverse=True)
+
+
+def cost(log: LaserLog, sensor: SensorConfig, config: MappingConfig) -> float:
+    """Mean time to extract the lines of a scan and merge them, the first (compilation) left out, ms."""
+    line_map, covariance, spent = LineMap(config, sensor), np.diag([0.02, 0.02, math.radians(0.3)]) ** 2, 0.0
+    for k, (ranges, pose) in enumerate(zip(log.ranges, log.poses, strict=True)):
+        begin = time.process_time()
+        line_map.insert(extract_lines(log.angles, ranges, sensor, config), pose, covariance)
+        spent += time.process_time() - begin if k else 0.0
+    return 1e3 * spent / max(len(log.poses) - 1, 1)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", nargs="+", type=Path)
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--pictures", type=Path, help="folder for a picture of each map")
     arguments = parser.parse_args()
-    sensor = SensorConfig(max_range=30.0, sigma_range=0.01, sigma_angle=math.radians(0.1))
-    config = MappingConfig(range_floor=0.01)
-    pose_covariance = np.diag([0.02**2, 0.02**2, math.radians(0.3) ** 2])
+    head = [
+        "log", "check", "scans", "points", "lines of scans", "lines", "compression", "segments", "fragments",
+        "on lines", "distance", "distance, all", "open stretches", "ms a scan",
+    ]  # fmt: skip
+    rows = []
     for path in arguments.logs:
-        angles, ranges, poses = read(path)
-        line_map, found, cost = LineMap(config, sensor), [], 0.0
-        for k in range(len(poses)):
-            begin = time.process_time()
-            found.append(extract_lines(angles, ranges[k], sensor, config))
-            line_map.insert(found[-1], poses[k], pose_covariance)
-            cost += time.process_time() - begin if k else 0.0
-        returns = int((ranges < sensor.max_range).sum())
-        lines = int(line_map.line_alive.sum())
-        single = sum(f.rho.size for f in found)
-        distances = np.concatenate([point_distances(f, angles, r) for f, r in zip(found, ranges, strict=True)])
-        on = line_map.alive & (line_map.line >= 0)
-        seen_through = np.zeros(line_map.alive.size, int)
-        for k in range(0, len(poses), 3):
-            seen_through += crossed(line_map, angles, np.minimum(ranges[k], 30.0), poses[k], 0.3) > 3
-        print(
-            f"{path.name}: {len(poses)} scans, {returns} points, {single} lines of single scans, {lines} lines merged "
-            f"(compression {1 - lines / returns:.4f}), {on.sum()} segments, {(line_map.alive & ~on).sum()} fragments; "
-            f"points on lines {distances.size / returns:.3f}, median distance {1e3 * np.median(distances):.1f} mm; "
-            f"segments seen through in 3 scans or more {np.sum(seen_through[on] >= 3)}; "
-            f"{1e3 * cost / (len(poses) - 1):.3f} ms a scan"
-        )
-        if arguments.picture:
-            draw(line_map, angles, ranges, poses, seen_through, arguments.picture / f"{path.name}.png")
-
-
-def draw(line_map: LineMap, angles: np.ndarray, ranges: np.ndarray, poses: np.ndarray, through: np.ndarray, path: Path):
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    _, axes = plt.subplots(figsize=(24, 24))
-    for k in range(0, len(poses), 4):
-        t, r = angles + poses[k, 2], np.where(ranges[k] < 30, ranges[k], np.nan)
-        axes.plot(poses[k, 0] + r * np.cos(t), poses[k, 1] + r * np.sin(t), ".", color="0.8", ms=2)
-    axes.plot(poses[:, 0], poses[:, 1], "c.", ms=3)
-    for row in np.flatnonzero(line_map.alive):
-        s = line_map.segments[row]
-        color = "m" if line_map.line[row] < 0 else "r" if through[row] >= 3 else "k"
-        axes.plot(s[::2], s[1::2], "-", color=color, lw=1)
-    axes.set_aspect("equal")
-    plt.savefig(path, dpi=60, bbox_inches="tight")
-    plt.close()
+        log = read_log(path)
+        sensor, config = sensor_of(log), MappingConfig(range_floor=0.01)
+        spent = cost(log, sensor, config)
+        for ratio in (0.0, 3.0):
+            made = map_log(log, sensor, config, ratio=ratio)
+            gaps = open_stretches(made, log, sensor.max_range)
+            name = path.name.partition(".")[0]
+            rows.append(
+                [
+                    name,
+                    "yes" if ratio else "no",
+                    str(len(made.path)),
+                    str(len(made.points)),
+                    str(made.lines_of_scans),
+                    str(made.rho.size),
+                    f"{100 * made.compression:.2f} %",
+                    str(len(made.segments)),
+                    str(len(made.fragments)),
+                    f"{100 * made.on_line.mean():.1f} %",
+                    f"{1e3 * made.median_distance:.1f} mm",
+                    f"{1e3 * np.median(made.distances):.1f} mm",
+                    f"{len(gaps)}" + (f", up to {gaps[0]:.2f} m" if gaps else ""),
+                    f"{spent:.3f}",
+                ]
+            )
+        if arguments.pictures:
+            arguments.pictures.mkdir(parents=True, exist_ok=True)
+            save_map(made, arguments.pictures / f"{name}.png", name=name)
+    print(format_table(head, rows))
+    print("distance: median, from the points on lines (all: from all points) to the nearest segment")
+    print(f"open stretches: of {DOOR} m or more")
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, Mi
 if TYPE_CHECKING:
     from polyexplore_gym.evaluation import EpisodeRecord, Study, Summary
     from polyexplore_gym.floorplan import FloorPlan
+    from polyexplore_gym.mapping import LaserLog, LogMap
     from polyexplore_gym.snapshot import Snapshot
 
 BENCH_PLANS = {"home-test": 12, "angled-test": 4, "office-test": 2}
@@ -31,6 +32,9 @@ BENCH_PLANS = {"home-test": 12, "angled-test": 4, "office-test": 2}
 All scripted policies and both placements then take about three minutes on two cores.
 """
 SCRIPTED = ("nearest", "largest", "ekman_ratio", "modified_sum", "utility", "distance_advantage", "random")
+
+SHOWN = 10
+"""So many broken parts of a log are named, the rest is counted."""
 
 PLAN_SUFFIXES = (".json", ".geojson", ".yaml", ".yml")
 """What is taken for a plan in a folder."""
@@ -102,6 +106,48 @@ class Run:
     """Film: a frame every so many metres as well; 0: decisions only."""
     fps: float = 10.0
     """Film: frames a second."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Linemap:
+    """Make the line map of a laser log; prints a summary and writes the map.
+
+    Logs are CARMEN (FLASER or ROBOTLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b)
+    and poses (n, 3), in rad and m, and optionally max_range and pose_covariance, (3, 3) or (n, 3, 3).
+    """
+
+    log: tyro.conf.Positional[Path]
+    """The log."""
+    out: tuple[Path, ...] = (Path("results/linemap"),)
+    """Files to write, .json, .geojson, .svg or .png, or folders, which get one of each, named after the log."""
+    max_range: float | None = None
+    """Range from which on a beam has no return, m (default: what the log says, else 30)."""
+    sigma_range: float = 0.01
+    """Standard deviation of the range noise, m."""
+    sigma_angle: float = 0.1
+    """Standard deviation of the beam angle noise, degrees."""
+    range_floor: float = 0.01
+    """Smallest standard deviation of range assumed in the fit, m."""
+    field_of_view: float | None = None
+    """FLASER only: angle between the first and the last beam, degrees (default: 180, less a step if beams are even)."""
+    sigma_xy: float = 0.02
+    """Standard deviation of the poses' x and y, m, unless the log gives covariances."""
+    sigma_heading: float = 0.3
+    """Standard deviation of the poses' heading, degrees, unless the log gives covariances."""
+    every: int = 1
+    """Use only every so many-th scan."""
+    min_travel: float = 0.0
+    """Use only scans at least so far from the last one used, m, or turned against it by half a radian."""
+    start: Literal["endpoint", "hough"] = "endpoint"
+    """First guess of a scan's lines: iterative end-point fit, or probabilistic Hough transform."""
+    merge_gate: float = 9.21
+    """Chi-square gate (2 degrees of freedom) of the merge test."""
+    door_width: float = 0.5
+    """A gap along a line that is wider is not bridged, m."""
+    ratio: float = 3.0
+    """Cut walls where more than so many beams passed through for each that ended there; 0: never."""
+    width: int = 1600
+    """Width of a .png, pixels."""
 
 
 def bench(options: Bench) -> int:
@@ -179,7 +225,71 @@ def run(options: Run) -> int:
     return 0 if record.status != "failed" else 1
 
 
-_COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {"bench": (Bench, bench), "run": (Run, run)}
+def linemap(options: Linemap) -> int:
+    """Make the line map of a log."""
+    import math
+
+    from tqdm import tqdm
+
+    from polyexplore_gym.config import MappingConfig
+    from polyexplore_gym.mapping import map_log, read_log, save_map, sensor_of
+
+    files = _map_files(options)
+    fov = options.field_of_view
+    if fov is not None and not 0 < fov <= 360:
+        raise InvalidConfigError(f"--field-of-view {fov}: must lie in (0, 360]")
+    config = MappingConfig(
+        start=options.start,
+        merge_gate=options.merge_gate,
+        door_width=options.door_width,
+        range_floor=options.range_floor,
+    )
+    size = os.path.getsize(options.log) if os.path.isfile(options.log) else None
+    with tqdm(total=size, desc="read", unit="B", unit_scale=True, dynamic_ncols=True) as bar:
+        log = read_log(
+            options.log,
+            field_of_view=None if fov is None else math.radians(fov),
+            watch=lambda done: bar.update(done - bar.n),
+        )
+    for path in files:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InvalidConfigError(f"{path.parent}: the folder cannot be made: {error.strerror}") from error
+    for part in log.broken[:SHOWN]:
+        _say(f"left out: {part}")
+    if len(log.broken) > SHOWN:
+        _say(f"left out: {len(log.broken) - SHOWN} more")
+    for message, number in log.unread.items():
+        _say(f"left out: {number} {message} scans; the FLASER scans are read")
+    sensor = sensor_of(log, options.max_range, options.sigma_range, math.radians(options.sigma_angle))
+    result = map_log(
+        log,
+        sensor,
+        config,
+        sigma_xy=options.sigma_xy,
+        sigma_heading=math.radians(options.sigma_heading),
+        every=options.every,
+        min_travel=options.min_travel,
+        ratio=options.ratio,
+        track=lambda scans, what: tqdm(scans, desc=what, unit="scan", dynamic_ncols=True),
+    )
+    print(_linemap_text(options.log.name, log, result))
+    for path in files:
+        try:
+            save_map(result, path, name=_stem(options.log), width=options.width)
+        except MissingDependencyError as error:
+            _say(f"no {path.name}: {error}")
+        else:
+            print(f"written: {path}")
+    return 0
+
+
+_COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
+    "bench": (Bench, bench),
+    "run": (Run, run),
+    "linemap": (Linemap, linemap),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -287,7 +397,7 @@ def _bench_plots(study: Study, records: list[EpisodeRecord], summary: Summary, o
 
     from polyexplore_gym.evaluation import plots
 
-    figure = plots.coverage_figure(records, np.random.default_rng(0), reference=options.reference)
+    figure = plots.coverage_figure(records, reference=options.reference)
     written = [plots.save(figure, options.out / "coverage.png")]
     written.append(plots.save(plots.ratio_figure(summary), options.out / "ratios.png"))
     # One plan of middle size, seen with every policy.
@@ -356,6 +466,52 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
         f"  seen          {100 * record.coverage:.1f} % ({', '.join(reached)})\n"
         f"  measurements  {record.measurements}\n"
         f"  collisions    {record.collisions}"
+    )
+
+
+def _stem(log: Path) -> str:
+    """The log's name without .log.gz and the like."""
+    return Path(log.name.removesuffix(".gz")).stem
+
+
+def _map_files(options: Linemap) -> list[Path]:
+    """The files to write; rejects what cannot be written before the work and not after it."""
+    from polyexplore_gym.animation import require
+    from polyexplore_gym.mapping import MAP_SUFFIXES
+
+    if not 100 <= options.width <= 20_000:
+        raise InvalidConfigError(f"--width {options.width}: must lie in 100 to 20000")
+    files = []
+    for path in options.out:
+        if path.is_dir() or not path.suffix:
+            if path.exists() and not path.is_dir():
+                raise InvalidConfigError(f"{path}: is a file, not a folder")
+            files += [path / (_stem(options.log) + suffix) for suffix in MAP_SUFFIXES]
+            continue
+        if path.suffix.lower() not in MAP_SUFFIXES:
+            raise InvalidConfigError(
+                f"{path}: the name must end in {' or '.join(MAP_SUFFIXES)}, or be that of a folder"
+            )
+        if not path.parent.is_dir():
+            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+        if path.suffix.lower() in (".svg", ".png"):
+            require("matplotlib", "plots")
+        files.append(path)
+    return files
+
+
+def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
+    points, lines = len(made.points), made.rho.size
+    on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
+    return (
+        f"{name}: {len(log.ranges)} scans of {log.angles.size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"  points        {points} ({on_lines})\n"
+        f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
+        f"{len(made.fragments)} fragments\n"
+        f"  compression   {f'{100 * made.compression:.2f} % (lines to points)' if lines else '-'}\n"
+        f"  distance      {f'{1e3 * made.median_distance:.1f} mm' if lines else '-'} "
+        "(median, from the points on lines to the nearest segment)\n"
+        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut"
     )
 
 

@@ -1,6 +1,20 @@
-"""The line map: scan -> lines (`extract_lines`) -> map across scans (`LineMap`)."""
+"""The line map: scan -> lines (`extract_lines`) -> map across scans (`LineMap`); `read_log` and `map_log` for logs."""
 
+from polyexplore_gym.mapping.export import MAP_SUFFIXES, save_map
 from polyexplore_gym.mapping.extract import ScanLines, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
+from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
+from polyexplore_gym.mapping.logs import LaserLog, read_log
 
-__all__ = ["LineMap", "ScanLines", "extract_lines"]
+__all__ = [
+    "MAP_SUFFIXES",
+    "LaserLog",
+    "LineMap",
+    "LogMap",
+    "ScanLines",
+    "extract_lines",
+    "map_log",
+    "read_log",
+    "save_map",
+    "sensor_of",
+]

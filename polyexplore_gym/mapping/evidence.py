@@ -1,0 +1,140 @@
+"""Which walls of a map the beams contradict: what moved, doors that opened, lines through scattered returns.
+
+A line map only gains walls: what one scan saw stays. Afterwards every beam is held against every wall that it met.
+A beam that ended on the wall, within 5 cm + 3 sigma, speaks for the wall there; one that went on speaks against it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+STEP = 0.05
+"""Beams are counted on pieces of about this length, m."""
+WINDOW = 2
+"""The counts of so many pieces on both sides are added before they are compared."""
+LEAST_BEAMS = 5
+"""Fewest beams that contradict a piece."""
+LEAST_GAP = 0.2
+"""Shortest part that is cut out of a wall, or left of it where something is cut out, m."""
+CLEARANCE = 0.05
+"""What lies within this + 3 sigma of a wall lies on it, m."""
+OBLIQUE = math.cos(math.radians(80.0))
+"""A more oblique beam says nothing."""
+
+
+def pieces_of(segments: np.ndarray) -> np.ndarray:
+    """(R + 1,) where the pieces of each of R segments (R, 4) begin; the last entry is their number."""
+    length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
+    return np.concatenate([[0], np.cumsum(np.maximum(np.ceil(length / STEP), 1))]).astype(np.int64)
+
+
+@njit(cache=True)
+def count(
+    segments: np.ndarray,
+    begin: np.ndarray,
+    angles: np.ndarray,
+    ranges: np.ndarray,
+    max_range: float,
+    pose: np.ndarray,
+    covariance: np.ndarray,
+    var_range: float,
+    var_angle: float,
+    stopped: np.ndarray,
+    passed: np.ndarray,
+) -> None:
+    """Add one scan's beams to the counts of those that ended on each piece, and that passed through it.
+
+    Args:
+        segments: (R, 4) walls in the map frame, m.
+        begin: of `pieces_of`; `stopped` and `passed` (begin[-1],) are the counts.
+        angles: (b,) beam angles in the laser's frame, rad, increasing.
+        ranges: (b,) m; max_range or more is no return: free as far as that.
+        pose, covariance: (3,) and (3, 3) of the laser.
+        var_range, var_angle: of the noise, m2, rad2.
+    """
+    var_xy = 0.5 * (covariance[0, 0] + covariance[1, 1])
+    var_turn = var_angle + covariance[2, 2]
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    n = angles.size
+    for i in range(segments.shape[0]):
+        dx, dy = segments[i, 0] - pose[0], segments[i, 1] - pose[1]
+        ax, ay = c * dx + s * dy, c * dy - s * dx
+        dx, dy = segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1]
+        ux, uy = c * dx + s * dy, c * dy - s * dx
+        length = math.hypot(ux, uy)
+        if length < 1e-9:
+            continue
+        ux, uy = ux / length, uy / length
+        rho = ax * uy - ay * ux  # the normal (uy, -ux) points away from the laser if positive
+        nx, ny = (uy, -ux) if rho >= 0.0 else (-uy, ux)
+        rho = abs(rho)
+        if rho > max_range:
+            continue
+        low, high = math.atan2(ay, ax), math.atan2(ay + length * uy, ax + length * ux)
+        if low > high:
+            low, high = high, low
+        if high - low > math.pi:
+            low, high = high, low + 2.0 * math.pi
+        first, pieces = begin[i], begin[i + 1] - begin[i]
+        for turn in range(-1, 2):
+            shift = 2.0 * math.pi * turn
+            if low + shift > angles[n - 1] or high + shift < angles[0]:
+                continue
+            for k in range(np.searchsorted(angles, low + shift), n):
+                if angles[k] > high + shift:
+                    break
+                ct, st = math.cos(angles[k]), math.sin(angles[k])
+                across = ct * nx + st * ny
+                if across < OBLIQUE:
+                    continue
+                at = rho / across
+                along = (at * ct - ax) * ux + (at * st - ay) * uy
+                sigma = math.sqrt(var_range * across * across + var_xy + var_turn * at * at * (1.0 - across * across))
+                beyond = min(ranges[k], max_range) * across - rho
+                tolerance = CLEARANCE + 3.0 * sigma
+                q = first + min(max(int(along / length * pieces), 0), pieces - 1)
+                if beyond > tolerance:
+                    passed[q] += 1
+                elif beyond > -tolerance and ranges[k] < max_range:
+                    stopped[q] += 1
+
+
+def confirmed(
+    segments: np.ndarray, begin: np.ndarray, stopped: np.ndarray, passed: np.ndarray, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The parts of the segments (R, 4) that are not contradicted: parts (K, 4) and the segment of each (K,).
+
+    A piece is contradicted where more than `ratio` beams passed through it for each that ended on it.
+    """
+    parts, of = [], []
+    for i, segment in enumerate(segments):
+        near_stop, near_through = (_around(counts[begin[i] : begin[i + 1]]) for counts in (stopped, passed))
+        bad = (near_through >= LEAST_BEAMS) & (near_through > ratio * near_stop)
+        least = min(math.ceil(LEAST_GAP / STEP), bad.size)
+        good = _long(~_long(bad, least), least) if bad.any() else ~bad
+        edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0)).reshape(-1, 2)
+        for a, b in edges / bad.size:
+            along = segment[2:] - segment[:2]
+            parts.append(
+                segment if b - a == 1.0 else np.concatenate([segment[:2] + a * along, segment[:2] + b * along])
+            )
+            of.append(i)
+    return np.array(parts).reshape(-1, 4), np.array(of, dtype=np.int64)
+
+
+def _around(counts: np.ndarray) -> np.ndarray:
+    """The sum over each piece and its WINDOW neighbours on both sides."""
+    total = np.concatenate([[0], np.cumsum(counts)])
+    at = np.arange(counts.size)
+    return total[np.minimum(at + WINDOW + 1, counts.size)] - total[np.maximum(at - WINDOW, 0)]
+
+
+def _long(mask: np.ndarray, least: int) -> np.ndarray:
+    """The mask without runs shorter than `least`."""
+    out = mask.copy()
+    for a, b in np.flatnonzero(np.diff(mask.astype(int), prepend=0, append=0)).reshape(-1, 2):
+        out[a:b] = b - a >= least
+    return out

@@ -1,0 +1,212 @@
+"""A laser log to a line map: `map_log`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from polyexplore_gym.config import MappingConfig, SensorConfig
+from polyexplore_gym.errors import InvalidConfigError
+from polyexplore_gym.mapping.evidence import confirmed, count, pieces_of
+from polyexplore_gym.mapping.extract import extract_lines
+from polyexplore_gym.mapping.line_map import LineMap
+from polyexplore_gym.mapping.logs import LaserLog
+
+MAX_RANGE = 30.0
+"""Range from which on a beam has no return, if neither the log nor the user says, m."""
+TURN = 0.5
+"""A turn by so much counts as much as the least travel between two scans, rad."""
+RATIO = 3.0
+"""A wall goes where more than so many beams passed through for each that ended on it."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogMap:
+    """The line map of a log: L lines, K segments of wall on them, F fragments (obstacles without a line), map frame."""
+
+    rho: np.ndarray
+    """(L,) distance of each line from the map's origin, m: x cos(alpha) + y sin(alpha) = rho."""
+    alpha: np.ndarray
+    """(L,) direction of the line's normal, rad."""
+    covariance: np.ndarray
+    """(L, 2, 2) in the order (alpha, rho): rad2, rad m, m2."""
+    segments: np.ndarray
+    """(K, 4) end points x1, y1, x2, y2, m; the free space lies on the left."""
+    segment_line: np.ndarray
+    """(K,) index of the line of each segment."""
+    segment_sigma: np.ndarray
+    """(K,) standard deviation across each segment, m."""
+    fragments: np.ndarray
+    """(F, 4) end points, m."""
+    path: np.ndarray
+    """(scans used, 3) x, y (m), heading (rad) of the laser."""
+    points: np.ndarray
+    """(P, 2) all returns of the scans used, m."""
+    on_line: np.ndarray
+    """(P,) whether a return lies on a line of its own scan."""
+    distances: np.ndarray
+    """(P,) distance of each return to the nearest segment, m; inf without any."""
+    lines_of_scans: int
+    """Lines of the single scans, before merging."""
+    contradicted: int
+    """Segments that were dropped or cut because beams passed through them."""
+    fragments_contradicted: int
+    """Fragments likewise."""
+
+    @property
+    def compression(self) -> float:
+        """1 - lines / returns."""
+        return 1.0 - self.rho.size / max(len(self.points), 1)
+
+    @property
+    def median_distance(self) -> float:
+        """Median distance of the returns on lines to the nearest segment, m; inf without any."""
+        return float(np.median(self.distances[self.on_line])) if self.on_line.any() else math.inf
+
+
+def sensor_of(
+    log: LaserLog, max_range: float | None = None, sigma_range: float = 0.01, sigma_angle: float = math.radians(0.1)
+) -> SensorConfig:
+    """The laser of a log. max_range (m): None for what the log says, else 30; the noise is in m and rad."""
+    span = float(log.angles[-1] - log.angles[0])
+    step = span / (log.angles.size - 1)
+    return SensorConfig(
+        beams=log.angles.size,
+        # closed if the last beam neighbours the first
+        field_of_view=2.0 * math.pi if span + 1.5 * step > 2.0 * math.pi else span,
+        max_range=max_range if max_range is not None else log.max_range or MAX_RANGE,
+        sigma_range=sigma_range,
+        sigma_angle=sigma_angle,
+    )
+
+
+def map_log(
+    log: LaserLog,
+    sensor: SensorConfig | None = None,
+    config: MappingConfig | None = None,
+    *,
+    sigma_xy: float = 0.02,
+    sigma_heading: float = math.radians(0.3),
+    every: int = 1,
+    min_travel: float = 0.0,
+    ratio: float = RATIO,
+    track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
+) -> LogMap:
+    """The line map of a log.
+
+    The map only gains walls, so in the end every beam is held against every wall: where more than `ratio` beams
+    passed through for each that ended there the wall is cut (see `polyexplore_gym.mapping.evidence`).
+
+    Args:
+        log: of `read_log`.
+        sensor: of `sensor_of`, which is the default.
+        config: numbers and limits of the fit; by default a range floor of 1 cm, which real lasers need.
+        sigma_xy, sigma_heading: standard deviation of the poses (m, rad), if the log gives no covariance.
+        every: only every so many-th scan.
+        min_travel: only scans at least so far (m) from the last one used, or turned against it by 0.5 rad.
+        ratio: 0 keeps every wall.
+        track: wraps the scans of both passes, to show progress; its second argument names the pass.
+
+    Raises:
+        InvalidConfigError: a number is out of range.
+
+    Example:
+        >>> import numpy as np
+        >>> from polyexplore_gym.mapping import LaserLog, map_log
+        >>> angles = np.linspace(-0.5, 0.5, 101)
+        >>> log = LaserLog(angles, np.array([2.0 / np.cos(angles)]), np.zeros((1, 3)))
+        >>> map_log(log).segments.round(2) + 0.0
+        array([[ 2.  , -1.09,  2.  ,  1.09]])
+    """
+    sensor = sensor_of(log) if sensor is None else sensor
+    config = MappingConfig(range_floor=0.01) if config is None else config
+    for name, value, least in (
+        ("every", every, 1), ("min_travel", min_travel, 0), ("ratio", ratio, 0),
+        ("sigma_xy", sigma_xy, 0), ("sigma_heading", sigma_heading, 0),
+    ):  # fmt: skip
+        if not (math.isfinite(value) and value >= least):
+            raise InvalidConfigError(f"{name} = {value}: must be at least {least}")
+    used = _apart(log.poses, range(0, len(log.poses), every), min_travel)
+    if log.pose_covariance is None:
+        covariances = np.broadcast_to(np.diag([sigma_xy, sigma_xy, sigma_heading]) ** 2, (len(log.poses), 3, 3))
+    else:
+        covariances = log.pose_covariance
+    line_map, lines = LineMap(config, sensor), 0
+    points, on_line = [], []
+    for k in track(used, "lines"):
+        found = extract_lines(log.angles, log.ranges[k], sensor, config)
+        line_map.insert(found, log.poses[k], covariances[k])
+        lines += found.rho.size
+        hit = log.ranges[k] < sensor.max_range
+        points.append(_placed(log.angles[hit], log.ranges[k, hit], log.poses[k]))
+        on_line.append(found.point_segment[hit] >= 0)
+
+    rows = np.flatnonzero(line_map.alive)
+    # A row may have shrunk to a point, which is no obstacle of its own.
+    rows = rows[(line_map.segments[rows, :2] != line_map.segments[rows, 2:]).any(axis=1)]
+    whole, line = line_map.segments[rows], line_map.line[rows]
+    parts, of = whole, np.arange(rows.size)
+    if ratio > 0:
+        begin = pieces_of(whole)
+        stopped, passed = np.zeros(begin[-1], np.int64), np.zeros(begin[-1], np.int64)
+        noise = max(sensor.sigma_range, config.range_floor) ** 2, sensor.sigma_angle**2
+        for k in track(used, "check"):
+            scan = log.angles, log.ranges[k], sensor.max_range, log.poses[k], covariances[k]
+            count(whole, begin, *scan, *noise, stopped, passed)
+        parts, of = confirmed(whole, begin, stopped, passed, ratio)
+    intact = np.zeros(rows.size, bool)
+    same = (parts == whole[of]).all(axis=1)
+    intact[of[same]] = True
+
+    wall = line[of] >= 0
+    kept, segment_line = np.unique(line[of][wall], return_inverse=True)
+    every_point = np.concatenate(points)
+    return LogMap(
+        rho=line_map.rho[kept].copy(),
+        alpha=line_map.alpha[kept].copy(),
+        covariance=line_map.covariance[kept].copy(),
+        segments=parts[wall],
+        segment_line=segment_line,
+        segment_sigma=line_map.sigma[rows][of][wall],
+        fragments=parts[~wall],
+        path=log.poses[used],
+        points=every_point,
+        on_line=np.concatenate(on_line),
+        distances=_nearest(every_point, parts[wall]),
+        lines_of_scans=lines,
+        contradicted=int((~intact & (line >= 0)).sum()),
+        fragments_contradicted=int((~intact & (line < 0)).sum()),
+    )
+
+
+def _apart(poses: np.ndarray, candidates: Iterable[int], travel: float) -> list[int]:
+    """Those of the scans that lie so far apart, or are turned against each other; the first is always in."""
+    used: list[int] = []
+    for k in candidates:
+        if used and travel > 0:
+            dx, dy, turn = poses[k] - poses[used[-1]]
+            if math.hypot(dx, dy) < travel and abs(math.remainder(turn, 2.0 * math.pi)) < TURN:
+                continue
+        used.append(k)
+    return used
+
+
+def _placed(angles: np.ndarray, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(m, 2) end points of beams in the map frame, m."""
+    return pose[:2] + ranges[:, None] * np.stack([np.cos(angles + pose[2]), np.sin(angles + pose[2])], axis=1)
+
+
+def _nearest(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """(P,) distance of each point to the nearest segment, m; inf without any."""
+    out = np.full(len(points), np.inf)
+    tree: Any = shapely.STRtree(shapely.linestrings(segments.reshape(-1, 2, 2)))
+    for a in range(0, len(points) if len(segments) else 0, 100_000):  # in blocks, for the memory's sake
+        some = shapely.points(points[a : a + 100_000])
+        (at, _), distance = tree.query_nearest(some, all_matches=False, return_distance=True)
+        out[a + at] = distance
+    return out
