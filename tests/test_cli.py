@@ -117,6 +117,13 @@ def test_no_usable_plan_is_an_error(folder, tmp_path, capsys):
         (["run", "home-test/0", "--start", "-50", "0", "0"], "start"),
         (["run", "home-test/0", "--step", "-1"], "--step"),
         (["run", "home-test/0", "--seed", "-1"], "seed"),
+        (["linemap", "nowhere.log"], "nowhere.log: does not exist"),
+        (["linemap", "."], "is a folder"),
+        (["linemap", "x.log", "--out", "map.bmp"], "map.bmp"),
+        (["linemap", "x.log", "--out", "nowhere/map.json"], "nowhere"),
+        (["linemap", "x.log", "--width", "10"], "--width 10"),
+        (["linemap", "x.log", "--field-of-view", "400"], "--field-of-view 400"),
+        (["linemap", "x.log", "--merge-gate", "0"], "merge_gate"),
     ],
 )
 def test_bad_input_is_one_line(arguments, message, tmp_path, capsys, monkeypatch):
@@ -172,6 +179,72 @@ def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):
     assert files["mp4"].stat().st_size > 2000
     with Image.open(files["png"]) as picture:
         assert picture.size[0] == 240
+
+
+def carmen(path: Path, *junk: str) -> Path:
+    """A log of a laser that turns in the middle of a square room of 4 m, with broken lines at its end."""
+    angles = np.radians(np.arange(-90, 91))
+    lines = []
+    for heading in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        ranges = 2.0 / np.maximum(np.abs(np.cos(angles + heading)), np.abs(np.sin(angles + heading)))
+        lines.append(f"FLASER 181 {' '.join(f'{r:.2f}' for r in ranges)} 1 2 {heading} 0 0 0 0.5 host 0.5")
+    path.write_text("\n".join([*lines, *junk]) + "\n")
+    return path
+
+
+def test_a_log_becomes_a_map(tmp_path, capsys):
+    log, out = carmen(tmp_path / "room.log", "FLASER 181 1.0 2.0", "1 2 3"), tmp_path / "maps"
+    assert main(["linemap", str(log), "--out", str(out), str(tmp_path / "b.json")]) == 0
+    captured = capsys.readouterr()
+    assert sorted(path.name for path in out.iterdir()) == ["room.geojson", "room.json", "room.png", "room.svg"]
+    assert (out / "room.json").read_bytes() == (tmp_path / "b.json").read_bytes()
+    assert "left out: line 9: 4 fields do not fit a FLASER message of 181 ranges" in captured.err
+    assert "left out: line 10: not a CARMEN message" in captured.err
+    assert "8 scans of 181 beams, 8 used, 2 broken" in captured.out
+    data = json.loads((tmp_path / "b.json").read_text())
+    assert len(data["lines"]) == 4
+    assert f"points        {data['points']} (" in captured.out
+    assert f"compression   {100 * (1 - 4 / data['points']):.2f} %" in captured.out
+    ends = np.array([segment for line in data["lines"] for segment in line["segments"]])
+    assert np.abs(ends).max() == pytest.approx(4.0, abs=0.02)  # the room goes from -1 to 3 and from 0 to 4
+    # Progress with the time left, both when reading and for the scans.
+    assert "8/8" in captured.err
+    # Options reach the library.
+    assert main(["linemap", str(log), "--out", str(tmp_path / "c.json"), "--every", "4", "--max-range", "2.5"]) == 0
+    fewer = json.loads((tmp_path / "c.json").read_text())
+    assert fewer["scans"] == 2
+    assert 0 < fewer["points"] < data["points"] / 4
+
+
+def test_many_broken_lines_are_counted(tmp_path, capsys):
+    log = carmen(tmp_path / "room.log", *["FLASER 181 1.0"] * 25)
+    assert main(["linemap", str(log), "--out", str(tmp_path / "a.json")]) == 0
+    captured = capsys.readouterr()
+    assert captured.err.count("left out: line") == 10
+    assert "left out: 15 more" in captured.err
+    assert "25 broken" in captured.out
+
+
+def test_a_log_that_cannot_be_read_leaves_nothing_behind(tmp_path, capsys):
+    (tmp_path / "empty.log").touch()
+    (tmp_path / "film.log").write_bytes(bytes(range(256)) * 50)
+    for name, reason in (("empty.log", "is empty"), ("film.log", "no usable FLASER or ROBOTLASER1 message")):
+        assert main(["linemap", str(tmp_path / name), "--out", str(tmp_path / "maps")]) == 2
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert last.startswith(f"error: {tmp_path / name}: {reason}")
+    assert not (tmp_path / "maps").exists()
+
+
+def test_without_matplotlib_there_are_maps(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib.collections", None)
+    log = str(carmen(tmp_path / "room.log"))
+    assert main(["linemap", log, "--out", str(tmp_path / "maps")]) == 0
+    assert "no room.png: this needs matplotlib" in capsys.readouterr().err
+    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == ["room.geojson", "room.json"]
+    assert main(["linemap", log, "--out", str(tmp_path / "a.png")]) == 2
+    assert "polyexplore-gym[plots]" in capsys.readouterr().err
 
 
 def test_an_own_policy_that_fails_is_told(folder, capsys):

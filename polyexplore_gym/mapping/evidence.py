@@ -14,7 +14,7 @@ from numba import njit
 STEP = 0.05
 """Beams are counted on pieces of about this length, m."""
 WINDOW = 2
-"""The counts of so many pieces on both sides are added before they are compared."""
+"""The counts of so many pieces on both sides are added before they are compared: single beams scatter."""
 LEAST_BEAMS = 5
 """Fewest beams that contradict a piece."""
 LEAST_GAP = 0.2
@@ -111,8 +111,9 @@ def confirmed(
     """
     parts, of = [], []
     for i, segment in enumerate(segments):
-        near_stop, near_through = (_around(counts[begin[i] : begin[i + 1]]) for counts in (stopped, passed))
-        bad = (near_through >= LEAST_BEAMS) & (near_through > ratio * near_stop)
+        stop, through = stopped[begin[i] : begin[i + 1]], passed[begin[i] : begin[i + 1]]
+        bad = (_around(through) >= LEAST_BEAMS) & (_around(through) > ratio * _around(stop))
+        bad |= (_around(bad) > 0) & (through > ratio * stop)  # as far as the edges of the opening
         least = min(math.ceil(LEAST_GAP / STEP), bad.size)
         good = _long(~_long(bad, least), least) if bad.any() else ~bad
         edges = np.flatnonzero(np.diff(good.astype(int), prepend=0, append=0)).reshape(-1, 2)

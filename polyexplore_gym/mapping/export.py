@@ -147,6 +147,7 @@ def map_figure(log_map: LogMap, name: str, width: int = 1600) -> Figure:
     ax.plot(*log_map.points[::thin].T, color=_POINT, markersize=1.5, zorder=1, **dots)
     ax.plot(*log_map.path[:, :2].T, color=_PATH, markersize=3.5, zorder=2, **dots)
     for pieces, color, thick in ((log_map.fragments, _FRAGMENT, 0.8), (log_map.segments, _WALL, 1.3)):
+        thick = max(thick, 1.2 * 72.0 / figure.dpi)  # at least a pixel, or it turns grey
         ax.add_collection(LineCollection(list(pieces.reshape(-1, 2, 2)), colors=color, linewidths=thick, zorder=3))
 
     def note(x: float, text: str, color: str = _INK, **style: Any) -> None:

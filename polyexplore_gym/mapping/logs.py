@@ -127,9 +127,11 @@ def read_log(
 
 
 class _Beams(NamedTuple):
-    """How the beams of a scan lie; the scans of one log share it."""
+    """How a scan is written and its beams lie; the scans of one log share it."""
 
     message: str
+    fields: int
+    """Behind the ranges, but for remissions."""
     count: int
     start: float
     step: float
@@ -172,14 +174,13 @@ def _read_carmen(
     for beams, some in scans.items():
         total[beams.message] += len(some)
     message = next(name for name in MESSAGES if total[name])
-    # Most scans decide how the beams lie; the first of equals.
+    # Most scans decide; the first of equals. With ranges too many or too few a line may still be some other message.
     beams = max((b for b in scans if b.message == message), key=lambda b: len(scans[b]))
     kept = scans[beams]
     for other, some in scans.items():
         if other.message == message and other != beams:
-            reason = (
-                f"{other.count} beams from {math.degrees(other.start):.2f} degrees on, unlike most scans of the log"
-            )
+            form = f"{other.count} beams from {math.degrees(other.start):.2f} degrees on, {other.fields} fields behind"
+            reason = f"unlike most scans of the log: {form}"
             broken += [(scan.line, reason) for scan in some]
     return LaserLog(
         angles=beams.start + beams.step * np.arange(beams.count),
@@ -235,31 +236,35 @@ def _parse(
     if not BEAMS[0] <= count <= BEAMS[1]:
         raise _LineError(f"{count} ranges; a scan has {BEAMS[0]} to {BEAMS[1]}")
     rest = fields[at + 1 + count :]
-    pose = _pose(fields[0], rest)
-    if pose is None:
+    tail = _tail(fields[0], rest)
+    if tail is None:
         raise _LineError(f"{len(fields)} fields do not fit a {fields[0]} message of {count} ranges, truncated perhaps")
     ranges = _numbers(fields[at + 1 : at + 1 + count], "range")
     if np.isnan(ranges).any():
         raise _LineError(f"range {int(np.isnan(ranges).argmax()) + 1} is NaN")
-    x, y, heading = _numbers(pose, "pose").tolist()
+    numbers, behind = _numbers(rest[slice(*tail)], "field behind the ranges,"), len(rest) - tail[0]
+    x, y, heading = numbers[:3].tolist()
     if not (math.isfinite(heading) and abs(x) <= FARTHEST and abs(y) <= FARTHEST):
         raise _LineError(f"the pose is {x}, {y}, {heading}")
-    beams = _flaser(count, field_of_view) if at == 1 else _robotlaser(count, _numbers(fields[1:8], "field"))
+    if at == 1:
+        beams = _flaser(behind, count, field_of_view)
+    else:
+        beams = _robotlaser(behind, count, _numbers(fields[1:8], "field"))
     return beams, np.where(ranges > 0.0, ranges, np.inf), (x, y, heading)
 
 
-def _pose(message: str, rest: list[str]) -> list[str] | None:
-    """The fields of the pose among those behind the ranges; None if their number is wrong.
+def _tail(message: str, rest: list[str]) -> tuple[int, int] | None:
+    """Where in the fields behind the ranges the numbers lie that begin with the pose; None if they are too many or few.
 
-    Their number must be exact: with a range too many or too few the pose would be read from beside it.
+    With a range too many or too few the pose would be read from beside it.
     """
     n = len(rest)
     if message == "FLASER":
-        return rest[:3] if n in (6, 9) else None
+        return (0, 6) if n in (6, 9) else None
     if n in (10, 13):  # older logs: no remissions, no turn_axis
-        return rest[:3]
+        return 0, 10
     remissions = int(rest[0]) if n and rest[0].isdecimal() and len(rest[0]) <= 6 else n
-    return rest[1 + remissions : 4 + remissions] if n - 1 - remissions in (11, 14) else None
+    return (1 + remissions, 12 + remissions) if n - 1 - remissions in (11, 14) else None
 
 
 def _numbers(fields: list[str], what: str) -> np.ndarray:
@@ -274,20 +279,20 @@ def _numbers(fields: list[str], what: str) -> np.ndarray:
         raise
 
 
-def _flaser(count: int, field_of_view: float | None) -> _Beams:
+def _flaser(behind: int, count: int, field_of_view: float | None) -> _Beams:
     if field_of_view is None:
         # 181 and 361 beams: both ends of 180 degrees; 180 and 360: the last beam is left out.
         start, step = -math.pi / 2, math.pi / (count - 1 if count % 2 else count)
     else:
         start, step = -field_of_view / 2, field_of_view / (count - 1)
-    return _Beams("FLASER", count, start, step, None)
+    return _Beams("FLASER", behind, count, start, step, None)
 
 
-def _robotlaser(count: int, settings: np.ndarray) -> _Beams:
+def _robotlaser(behind: int, count: int, settings: np.ndarray) -> _Beams:
     start, step, max_range = (float(value) for value in settings[[1, 3, 4]])
     if not (abs(start) <= 2 * math.pi and 0 < step <= (2 * math.pi + 1e-6) / (count - 1)):
         raise _LineError(f"start angle {start} and angular resolution {step} do not fit {count} ranges")
-    return _Beams("ROBOTLASER1", count, start, step, min(max_range, CODES) if max_range > 0 else None)
+    return _Beams("ROBOTLASER1", behind, count, start, step, min(max_range, CODES) if max_range > 0 else None)
 
 
 def _read_npz(raw: IO[bytes]) -> LaserLog:
