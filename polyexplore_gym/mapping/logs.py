@@ -132,7 +132,7 @@ class _Beams(NamedTuple):
     message: str
     fields: int
     """Behind the ranges, but for remissions."""
-    count: int
+    size: int
     start: float
     step: float
     max_range: float | None
@@ -179,11 +179,11 @@ def _read_carmen(
     kept = scans[beams]
     for other, some in scans.items():
         if other.message == message and other != beams:
-            form = f"{other.count} beams from {math.degrees(other.start):.2f} degrees on, {other.fields} fields behind"
+            form = f"{other.size} beams from {math.degrees(other.start):.2f} degrees on, {other.fields} fields behind"
             reason = f"unlike most scans of the log: {form}"
             broken += [(scan.line, reason) for scan in some]
     return LaserLog(
-        angles=beams.start + beams.step * np.arange(beams.count),
+        angles=beams.start + beams.step * np.arange(beams.size),
         ranges=np.array([scan.ranges for scan in kept]),
         poses=np.array([scan.pose for scan in kept]),
         max_range=beams.max_range,
@@ -196,7 +196,7 @@ class _LineError(ValueError):
     """Why a line is broken."""
 
 
-def _lines(stream: IO[bytes]) -> Iterator[bytes | _LineError]:
+def _lines(stream: IO[bytes] | gzip.GzipFile) -> Iterator[bytes | _LineError]:
     """The lines; an error for what cannot be read as a line. Damage in a compressed file ends them."""
     try:
         while line := stream.readline(MAX_LINE):
