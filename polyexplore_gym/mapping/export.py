@@ -153,7 +153,7 @@ def map_figure(log_map: LogMap, name: str, width: int = 1600) -> Figure:
     def note(x: float, text: str, color: str = _INK, **style: Any) -> None:
         figure.text(x, 0.5 * below / (inches * shape + below), text, color=color, va="center", **style)
 
-    note(0.015, name, size=10, weight="bold")
+    note(0.015, name if len(name) <= 40 else name[:39] + "…", size=10, weight="bold")
     note(0.40, f"{log_map.rho.size} lines", _WALL, size=9)
     note(0.50, f"{len(log_map.fragments)} fragments", _FRAGMENT, size=9)
     note(0.64, f"{len(log_map.path)} scans", _PATH, size=9)

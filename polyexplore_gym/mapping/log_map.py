@@ -110,7 +110,7 @@ def map_log(
         every: only every so many-th scan.
         min_travel: only scans at least so far (m) from the last one used, or turned against it by 0.5 rad.
         ratio: 0 keeps every wall.
-        track: wraps the scans of both passes, to show progress; its second argument names the pass.
+        track: wraps the scans of each pass, to show progress; its second argument names the pass.
 
     Raises:
         InvalidConfigError: a number is out of range.
@@ -165,7 +165,8 @@ def map_log(
 
     wall = line[of] >= 0
     kept, segment_line = np.unique(line[of][wall], return_inverse=True)
-    every_point = np.concatenate(points)
+    tree: Any = shapely.STRtree(shapely.linestrings(parts[wall].reshape(-1, 2, 2)))
+    distances = [_nearest(some, tree) for some, _ in zip(points, track(used, "distances"), strict=True)]
     return LogMap(
         rho=line_map.rho[kept].copy(),
         alpha=line_map.alpha[kept].copy(),
@@ -175,9 +176,9 @@ def map_log(
         segment_sigma=line_map.sigma[rows][of][wall],
         fragments=parts[~wall],
         path=log.poses[used],
-        points=every_point,
+        points=np.concatenate(points),
         on_line=np.concatenate(on_line),
-        distances=_nearest(every_point, parts[wall]),
+        distances=np.concatenate(distances),
         lines_of_scans=lines,
         contradicted=int((~intact & (line >= 0)).sum()),
         fragments_contradicted=int((~intact & (line < 0)).sum()),
@@ -201,12 +202,9 @@ def _placed(angles: np.ndarray, ranges: np.ndarray, pose: np.ndarray) -> np.ndar
     return pose[:2] + ranges[:, None] * np.stack([np.cos(angles + pose[2]), np.sin(angles + pose[2])], axis=1)
 
 
-def _nearest(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    """(P,) distance of each point to the nearest segment, m; inf without any."""
+def _nearest(points: np.ndarray, tree: Any) -> np.ndarray:
+    """(m,) distance of each point (m, 2) to the nearest segment in a `shapely.STRtree`, m; inf without any."""
     out = np.full(len(points), np.inf)
-    tree: Any = shapely.STRtree(shapely.linestrings(segments.reshape(-1, 2, 2)))
-    for a in range(0, len(points) if len(segments) else 0, 100_000):  # in blocks, for the memory's sake
-        some = shapely.points(points[a : a + 100_000])
-        (at, _), distance = tree.query_nearest(some, all_matches=False, return_distance=True)
-        out[a + at] = distance
+    (at, _), distance = tree.query_nearest(shapely.points(points), all_matches=False, return_distance=True)
+    out[at] = distance
     return out

@@ -182,7 +182,7 @@ def test_scans_are_chosen():
     np.testing.assert_array_equal(map_log(log, min_travel=1.0).path, log.poses[[0, 4, 8, 12]])
     seen = []
     map_log(log, every=4, track=lambda scans, what: seen.append((what, len(list(scans)))) or scans)
-    assert seen == [("lines", 4), ("check", 4)]
+    assert seen == [("lines", 4), ("check", 4), ("distances", 4)]
 
 
 def test_the_sensor_of_a_log():
