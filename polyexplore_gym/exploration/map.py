@@ -14,7 +14,8 @@ from numba import njit
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
-from polyexplore_gym.exploration.path_graph import Known, PathGraph
+from polyexplore_gym.exploration.corners import Known
+from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.scan import Scan
 
 _PIECE = 2.0
@@ -132,11 +133,10 @@ class ExplorationMap:
         self.done = np.zeros(0, np.bool_)
         self.owner = np.zeros(0, np.int64)
         self.chains = Chains.none()
-        self.graph = PathGraph(radius, _SPARE, 0.012)
+        self.graph = PathGraph(radius, _SPARE, 0.012, _SLACK)
         self.robot = -1
         self._start: list[tuple[float, float]] = []
         self._next_id = 0
-        self.bumps = np.zeros((0, 4))
         self._trail: list[np.ndarray] = []
         self._touched: list[np.ndarray] = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
@@ -270,8 +270,7 @@ class ExplorationMap:
         """Remember an obstacle felt at `bearing` (rad, map frame) on the robot's rim at `pose` (3,): plan around it."""
         c, s = math.cos(bearing), math.sin(bearing)
         x, y = pose[0] + self.graph.radius * c, pose[1] + self.graph.radius * s
-        felt = np.array([[x + 0.01 * s, y - 0.01 * c, x - 0.01 * s, y + 0.01 * c]])
-        self.bumps = np.concatenate((self.bumps, felt))
+        self.graph.add_felt(np.array([x + 0.01 * s, y - 0.01 * c, x - 0.01 * s, y + 0.01 * c]))
 
     # Nodes and paths -------------------------------------------------------------------------
 
@@ -280,66 +279,39 @@ class ExplorationMap:
 
         `came` (k, 2) is the way that it came, the way back out of a tight place.
         """
-        g = self.graph
-        c = self.chains
+        g, c = self.graph, self.chains
         if self._touched:
-            touched = np.unique(np.concatenate(self._touched))
-            if len(self.bumps):
-                # Felt obstacles come first: their rows never shift when the line map grows.
-                walls = np.concatenate((self.bumps, walls))
-                alive = np.concatenate((np.ones(len(self.bumps), np.bool_), alive))
-                touched = np.concatenate((np.arange(len(self.bumps)), touched + len(self.bumps)))
             n = self.n_scans
             known = Known(
                 self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range
             )
-            g.set_walls(walls, alive, touched, known, self._box)
-            g.set_pieces(self.pieces, self.owner)
+            g.set_walls(walls, alive, np.unique(np.concatenate(self._touched)), known, self._box)
+            g.set_pieces(self.pieces, self.owner, self._box)
             g.add_way_point(float(pose[0]), float(pose[1]))
-            g.refresh(self._box, _SLACK)
         if self.robot >= 0:
             g.remove_leaves(np.array([self.robot]))
         self._start = self._way_out(float(pose[0]), float(pose[1]), came)
-        self.robot = g.add_leaf(*self._start[-1], -2, _SLACK)
+        self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
         reach = self.sensor.max_range
-        x0, y0, x1, y1 = self._box
-        local = (
-            (c.middle[:, 0] >= x0 - reach) & (c.middle[:, 0] <= x1 + reach)
-            & (c.middle[:, 1] >= y0 - reach) & (c.middle[:, 1] <= y1 + reach)
-        )  # fmt: skip
-        for i in np.flatnonzero(local):
-            v = int(c.vertex[i])
-            if v >= 0 and g.clearance(c.node[i, 0], c.node[i, 1]) < g.need - 0.02:
-                self._drop_vertices(c.vertex[i : i + 1])
-                c.vertex[i] = v = -1
-            if v < 0:
-                self._place(int(i))
-        self._update_sources()
+        local = ((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach)).all(axis=1)
+        self._place(np.flatnonzero(local))
+        self._update_paths()
         if came is not None:
             self._trail.append(came)
         if len(c) and not np.isfinite(c.path_length).any() and self._trail:
             g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
             self._trail = []
-            self._update_sources()
+            self._update_paths()
             local[:] = True
-        lost = np.flatnonzero(local & ~np.isfinite(c.path_length))
-        if len(lost):
-            seen = g.reachable(self.robot)
-            for i in lost:
-                self._place_within(int(i), seen)
-            self._update_sources()
-        if len(c) and not np.isfinite(c.path_length).any():
+        self._place_within(np.flatnonzero(local & ~np.isfinite(c.path_length)))
+        if not np.isfinite(c.path_length).any():
             # What is left lies behind slivers of the unknown: look at it across them.
-            seen = g.reachable(self.robot)
-            for row in range(len(c)):
-                self._place_within(row, seen, through_unknown=True)
-            self._update_sources()
-        which = np.flatnonzero(local)
+            self._place_within(np.arange(len(c)), through_unknown=True)
         nodes.gains(
-            which, c.node, c.vertex >= 0, c.middle, c.ends, c.id, np.ones(len(c), np.bool_), self.sensor.max_range,
-            g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, c.gain,
+            np.flatnonzero(local), c.node, c.vertex, c.middle, c.ends, c.id, self.sensor.max_range, g.walls,
+            *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, c.gain,
         )  # fmt: skip
-        g.compact()
+        g.recycle()
         self._touched = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
 
@@ -359,48 +331,51 @@ class ExplorationMap:
                     break
         return points
 
-    def _update_sources(self) -> None:
+    def _update_paths(self) -> None:
         g, c = self.graph, self.chains
+        g.connect()
         rows = np.flatnonzero(c.vertex >= 0)
-        vertices = c.vertex[rows]
-        if not np.array_equal(vertices, g.sources):
-            row_of = {int(v): k for k, v in enumerate(g.sources)}
-            g.set_sources(vertices, np.array([row_of.get(int(v), -1) for v in vertices], np.int64))
-        g.repair()
+        g.set_sources(c.vertex[rows])
         c.path_length[:] = math.inf
-        c.path_length[rows] = g.dist[:, self.robot] + sum(math.dist(a, b) for a, b in itertools.pairwise(self._start))
+        if len(rows):
+            out = sum(math.dist(a, b) for a, b in itertools.pairwise(self._start))
+            c.path_length[rows] = g.distances(c.vertex[rows], np.array([self.robot]))[:, 0] + out
 
-    def _rows(self, chain: int) -> np.ndarray:
-        return np.flatnonzero(self.owner == chain)
-
-    def _place(self, i: int) -> None:
-        """Put the node of a jump edge at its configured place, if the disc can stand there."""
+    def _place(self, which: np.ndarray) -> None:
+        """Put the nodes of jump edges at their configured places, if the disc can stand there."""
         g, c, config = self.graph, self.chains, self.config
-        (mx, my), (nx, ny) = c.middle[i], c.normal[i]
-        x, y = mx, my
-        if config.placement == "in_front":
-            sampled = c.length[i] / (config.samples * self.sensor.resolution)
-            d = min(config.front_distance, sampled)
-            x, y = mx - d * nx, my - d * ny
-        if nodes.stands(x, y, mx, my, c.id[i], g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need):
-            self._set_node(i, x, y, math.atan2(ny, nx))
-
-    def _place_within(self, i: int, seen: np.ndarray, through_unknown: bool = False) -> None:
-        """Put the node at the reachable place nearest to its jump edge that sees it, or mask it."""
-        g, c = self.graph, self.chains
-        x, y, heading, found = nodes.nearest_reachable(
-            self._rows(int(c.id[i])), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
-            self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
-            through_unknown,
+        front = config.front_distance if config.placement == "in_front" else 0.0
+        node, outcome = nodes.place(
+            which, c.node, c.vertex, c.middle, c.normal, c.length, c.id, front,
+            config.samples * self.sensor.resolution, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner,
+            g.need,
         )  # fmt: skip
-        if found:
-            self._drop_vertices(c.vertex[i : i + 1])
-            self._set_node(i, x, y, heading)
+        self._drop_vertices(c.vertex[which[outcome > 0]])
+        c.vertex[which[outcome > 0]] = -1
+        self._set_nodes(which[outcome == 2], node[outcome == 2])
 
-    def _set_node(self, i: int, x: float, y: float, heading: float) -> None:
+    def _place_within(self, which: np.ndarray, through_unknown: bool = False) -> None:
+        """Put nodes at the reachable places nearest to their jump edges that see them; without any they stay masked."""
+        if not len(which):
+            return
+        g, c = self.graph, self.chains
+        seen = g.reachable(self.robot)
+        node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
+        for k, i in enumerate(which):
+            *node[k], found[k] = nodes.nearest_reachable(
+                np.flatnonzero(self.owner == c.id[i]), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
+                self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
+                through_unknown,
+            )  # fmt: skip
+        if found.any():
+            self._drop_vertices(c.vertex[which[found]])
+            self._set_nodes(which[found], node[found])
+            self._update_paths()
+
+    def _set_nodes(self, which: np.ndarray, node: np.ndarray) -> None:
         c = self.chains
-        c.node[i] = x, y, heading
-        c.vertex[i] = self.graph.add_leaf(float(x), float(y), int(c.id[i]), _SLACK)
+        c.node[which] = node
+        c.vertex[which] = self.graph.add_leaves(node[:, :2], c.id[which])
 
     @property
     def reachable(self) -> np.ndarray:
@@ -409,17 +384,13 @@ class ExplorationMap:
 
     def path_to(self, i: int) -> np.ndarray:
         """Way points (k, 2) of the shortest path from the robot to node i."""
-        row = int(np.flatnonzero(self.graph.sources == self.chains.vertex[i])[0])
-        return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), self.graph.path(row, self.robot)))
+        way = self.graph.path(int(self.chains.vertex[i]), self.robot)
+        return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), way))
 
     def path_lengths(self, rows: np.ndarray) -> np.ndarray:
         """Path lengths (k, k) between the nodes `rows`, m; inf where there is no path."""
-        g, c = self.graph, self.chains
+        vertices = self.chains.vertex[rows]
         result = np.full((len(rows), len(rows)), math.inf)
-        with_vertex = np.flatnonzero(c.vertex[rows] >= 0)
-        if len(with_vertex):
-            vertices = c.vertex[rows[with_vertex]]
-            order = np.argsort(g.sources)
-            k = order[np.searchsorted(g.sources[order], vertices)]
-            result[np.ix_(with_vertex, with_vertex)] = g.dist[np.ix_(k, vertices)]
+        standing = np.flatnonzero(vertices >= 0)
+        result[standing[:, None], standing] = self.graph.distances(vertices[standing], vertices[standing])
         return result

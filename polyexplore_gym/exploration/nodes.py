@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.exploration.path_graph import REACH
+from polyexplore_gym.exploration.corners import REACH
 from polyexplore_gym.exploration.segments import clearance, crossing_free, sweep_free
 
 _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
@@ -57,6 +57,36 @@ def stands(x, y, mx, my, chain, walls, w_start, w_items, pieces, p_start, p_item
     if math.hypot(mx - x, my - y) < _SIGHT:
         return True
     return sees(x, y, mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain, chain)
+
+
+@njit(cache=True)
+def place(which, node, vertex, middle, normal, length, chain, front, spacing, walls, w_start, w_items, pieces,
+          p_start, p_items, owner, need):  # fmt: skip
+    """Nodes of the jump edges `which` at their configured place: (k, 3), and what came of each (k,).
+
+    The place is at most `front` m before the middle of the jump edge on its known side, and no farther than
+    `length` / `spacing` (the sampling condition). 0: the node that was there stays, or none can stand there; 1: the
+    old one must go; 2: a new one.
+    """
+    out = np.zeros((which.size, 3))
+    outcome = np.zeros(which.size, np.int8)
+    for k in range(which.size):
+        i = which[k]
+        if vertex[i] >= 0:
+            if clearance(node[i, 0], node[i, 1], walls, w_start, w_items, REACH) >= need - 0.02:
+                continue
+            outcome[k] = 1
+        d = min(front, length[i] / spacing)
+        x = middle[i, 0] - d * normal[i, 0]
+        y = middle[i, 1] - d * normal[i, 1]
+        if stands(
+            x, y, middle[i, 0], middle[i, 1], chain[i], walls, w_start, w_items, pieces, p_start, p_items, owner, need
+        ):
+            outcome[k] = 2
+            out[k, 0] = x
+            out[k, 1] = y
+            out[k, 2] = math.atan2(normal[i, 1], normal[i, 0])
+    return out, outcome
 
 
 @njit(cache=True)
@@ -132,7 +162,7 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
 
 
 @njit(cache=True)
-def gains(which, node, valid, middle, ends, chain, active, max_range, walls, w_start, w_items, pieces, p_start,
+def gains(which, node, vertex, middle, ends, chain, max_range, walls, w_start, w_items, pieces, p_start,
           p_items, owner, out):  # fmt: skip
     """g_n (Ekman): the sum of the angles that the jump edges subtend at node n where visible; pi for its own.
 
@@ -143,11 +173,11 @@ def gains(which, node, valid, middle, ends, chain, active, max_range, walls, w_s
         total = math.pi
         x = node[n, 0]
         y = node[n, 1]
-        if not valid[n]:
+        if vertex[n] < 0:
             out[n] = 0.0
             continue
         for i in range(middle.shape[0]):
-            if i == n or not active[i]:
+            if i == n:
                 continue
             if math.hypot(middle[i, 0] - x, middle[i, 1] - y) > max_range:
                 continue

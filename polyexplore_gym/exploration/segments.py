@@ -122,6 +122,15 @@ def clearance(px, py, segments, start, items, limit):
 
 
 @njit(cache=True)
+def clearances(points, segments, start, items, limit):
+    """`clearance` of points (k, 2)."""
+    out = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        out[i] = clearance(points[i, 0], points[i, 1], segments, start, items, limit)
+    return out
+
+
+@njit(cache=True)
 def sweep_free(ax, ay, bx, by, segments, start, items, radius):
     """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
     mask = start.size - 2

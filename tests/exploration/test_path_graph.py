@@ -11,28 +11,36 @@ import pytest
 import shapely
 from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths
 
-from polyexplore_gym.exploration.path_graph import DEAD, LEAF, OPEN, PathGraph
+from polyexplore_gym.exploration.corners import CORNER, LEAF
+from polyexplore_gym.exploration.path_graph import PathGraph
 
 RADIUS = 0.25
 SLACK = 0.3
 ALL = np.array([-1e3, -1e3, 1e3, 1e3])
+NO_PIECES, NO_OWNER = np.zeros((0, 4)), np.zeros(0, np.int64)
 
 
 def graph_of(walls, radius=RADIUS, pieces=None, owner=None):
     """The graph over all of the walls at once."""
-    graph = PathGraph(radius, 0.05, 0.012)
+    graph = PathGraph(radius, 0.05, 0.012, SLACK)
     graph.set_walls(walls, np.ones(len(walls), np.bool_), np.arange(len(walls)))
-    graph.set_pieces(np.zeros((0, 4)) if pieces is None else pieces, np.zeros(0, np.int64) if owner is None else owner)
-    graph.refresh(ALL, SLACK)
+    pieces, owner = (NO_PIECES, NO_OWNER) if pieces is None else (pieces, owner)
+    graph.set_pieces(pieces, owner, ALL)
+    graph.connect()
     return graph
+
+
+def leaf(graph, x, y, owner):
+    """One leaf."""
+    return int(graph.add_leaves(np.array([[x, y]]), np.array([owner]))[0])
 
 
 def fields(graph, points, owner=1000):
     """Leaves at the points, and the fields from all of them."""
-    leaves = np.array([graph.add_leaf(*p, owner + i, SLACK) for i, p in enumerate(points)])
-    graph.set_sources(leaves, np.full(len(points), -1))
-    graph.repair()
-    return leaves, graph.dist[:, leaves]
+    leaves = graph.add_leaves(points, owner + np.arange(len(points)))
+    graph.connect()
+    graph.set_sources(leaves)
+    return leaves, graph.distances(leaves, leaves)
 
 
 def compare(family, seed, count=10):
@@ -48,7 +56,7 @@ def compare(family, seed, count=10):
     for i in range(count):
         for j in range(count):
             if i != j and np.isfinite(ours[i, j]):
-                path = graph.path(i, int(leaves[j]))
+                path = graph.path(int(leaves[i]), int(leaves[j]))
                 np.testing.assert_allclose(path[[0, -1]], points[[j, i]])
                 assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(ours[i, j])
                 clearance = min(clearance, shapely.distance(lines, shapely.LineString(path)))
@@ -136,44 +144,53 @@ def test_open_edges_block_until_they_are_gone_and_never_their_owner():
     leaves, ours = fields(graph, points)
     assert np.isinf(ours[0, 1:]).all()
     assert ours[1, 2] == pytest.approx(1.0)
-    node = graph.add_leaf(0.0, 0.0, 7, SLACK)  # stands on its own edge
-    beyond = graph.add_leaf(2.0, 1.0, 7, SLACK)  # may look through its own edge
+    node = leaf(graph, 0.0, 0.0, 7)  # stands on its own edge
+    beyond = leaf(graph, 2.0, 1.0, 7)  # may look through its own edge
+    graph.connect()
     graph.repair()
-    assert graph.dist[0, node] == pytest.approx(math.hypot(2, 0.5))
-    assert graph.dist[0, beyond] == pytest.approx(math.hypot(4, 0.5))
+    lengths = graph.distances(leaves[:1], np.array([node, beyond]))
+    np.testing.assert_allclose(lengths, [[math.hypot(2, 0.5), math.hypot(4, 0.5)]])
     graph.remove_leaves(np.array([beyond]))
-    graph.set_pieces(pieces[:0], np.zeros(0, np.int64))
-    graph.refresh(ALL, SLACK)
+    graph.set_pieces(NO_PIECES, NO_OWNER, ALL)
     graph.repair()
-    assert graph.dist[0, leaves[1]] == pytest.approx(4.0)
+    assert graph.distances(leaves[:1], leaves[1:2]) == pytest.approx(4.0)
 
 
 # Repair -------------------------------------------------------------------------------------------
+
+
+def edges(graph):
+    """The open edges (e, 2)."""
+    living = np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist()
+    pairs = [(u, int(v)) for u in living for v in graph.neighbours(u)]
+    assert len(set(pairs)) == len(pairs)
+    assert {(v, u) for u, v in pairs} == set(pairs), "an edge is known at one of its ends only"
+    return np.array([(u, v) for u, v in pairs if u < v], np.int64).reshape(-1, 2)
 
 
 def exported(graph):
     """The living graph as networkx, leaves as dead ends seen from everywhere but themselves."""
     out = nx.Graph()
     out.add_nodes_from(np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist())
-    for e in np.flatnonzero(graph.state[: graph.n_edges] == OPEN):
-        u, v = graph.ends[e]
-        if min(graph.kind[u], graph.kind[v]) < 0:
-            continue  # a leaf that was taken out
-        length = float(graph.length[e])
+    for u, v in edges(graph).tolist():
+        first = graph.links.first[u]
+        length = float(graph.links.cost[first : first + graph.links.count[u]][graph.neighbours(u) == v][0])
         assert length == pytest.approx(math.dist(graph.position[u], graph.position[v]))
-        if not out.has_edge(u, v) or out.edges[u, v]["weight"] > length:
-            out.add_edge(int(u), int(v), weight=length)
+        out.add_edge(u, v, weight=length)
     return out
 
 
 def check_fields(graph):
     network = exported(graph)
     leaves = {v for v in network if graph.kind[v] == LEAF}
+    sources = graph.source_of[graph.source_of >= 0]
     again = copy.deepcopy(graph)
-    again.set_sources(graph.sources, np.full(len(graph.sources), -1))
-    living = graph.kind >= 0
-    np.testing.assert_allclose(graph.dist[:, living], again.dist[:, living], atol=1e-9)
-    for k, source in enumerate(graph.sources.tolist()):
+    again.source_of[:] = -1
+    again.row_of[:] = -1
+    again.set_sources(sources)
+    living = np.flatnonzero(graph.kind >= 0)
+    np.testing.assert_allclose(graph.distances(sources, living), again.distances(sources, living), atol=1e-9)
+    for source in sources.tolist():
         through = network.subgraph([v for v in network if v not in leaves or v == source])
         lengths = nx.single_source_dijkstra_path_length(through, source)
         for v in network:
@@ -187,9 +204,9 @@ def check_fields(graph):
                     ),
                     default=math.inf,
                 )
-            assert graph.dist[k, v] == pytest.approx(wanted, abs=1e-9)
+            assert graph.distances(np.array([source]), np.array([v])) == pytest.approx(wanted, abs=1e-9)
             if np.isfinite(wanted):
-                path = graph.path(k, v)
+                path = graph.path(source, v)
                 assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(wanted, abs=1e-9)
 
 
@@ -200,34 +217,34 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
     rng.shuffle(rows[4:])
     alive = np.zeros(len(rows), np.bool_)
     alive[: int(rng.integers(4, 12))] = True
-    graph = PathGraph(RADIUS, 0.05, 0.012)
+    graph = PathGraph(RADIUS, 0.05, 0.012, SLACK)
     touched = np.flatnonzero(alive)
-    pieces, owner = np.zeros((0, 4)), np.zeros(0, np.int64)
+    pieces, owner = NO_PIECES, NO_OWNER
     leaves: list[int] = []
     checked = 0
     for _ in range(25):
         graph.set_walls(rows.copy(), alive.copy(), touched)
-        graph.set_pieces(pieces, owner)
         x, y = rng.uniform(-4, 4, 2)
+        graph.set_pieces(pieces, owner, ALL if rng.random() < 0.5 else np.array([x - 3, y - 3, x + 3, y + 3]))
         graph.add_way_point(x, y)
-        graph.refresh(ALL if rng.random() < 0.5 else np.array([x - 3, y - 3, x + 3, y + 3]), SLACK)
+        if rng.random() < 0.3:
+            graph.add_felt(np.array([x, y, x + 0.02, y]))
         for _ in range(int(rng.integers(0, 5))):
             if leaves and rng.random() < 0.4:
                 v = leaves.pop(int(rng.integers(len(leaves))))
                 graph.remove_leaves(np.array([v]))
             else:
                 x, y = rng.uniform(-5, 5, 2)
-                leaves.append(graph.add_leaf(x, y, int(rng.integers(0, 5)), SLACK))
+                leaves.append(leaf(graph, x, y, int(rng.integers(0, 5))))
+        graph.connect()
         if rng.random() < 0.7:
-            chosen = [v for v in leaves if rng.random() < 0.7]
-            row_of = {int(v): k for k, v in enumerate(graph.sources)}
-            graph.set_sources(np.array(chosen, np.int64), np.array([row_of.get(v, -1) for v in chosen], np.int64))
+            graph.set_sources(np.array([v for v in leaves if rng.random() < 0.7], np.int64))
         if rng.random() < 0.7:
             graph.repair()
             check_fields(graph)
-            checked += len(graph.sources)
+            checked += (graph.source_of >= 0).sum()
             if rng.random() < 0.7:
-                graph.compact()
+                graph.recycle()
                 check_fields(graph)
         # Walls come, go and shift; open edges come and go.
         changes = rng.choice(len(rows), int(rng.integers(0, 5)), replace=False)
@@ -248,17 +265,16 @@ def test_edges_in_the_graph_keep_clear_of_walls_that_came_later():
     rows = np.vstack([box(-5, -5, 5, 5), scene("rooms", 60)[4:], scene("furnished", 1)[4:]])
     rows[4:] = rows[4:][rng.permutation(len(rows) - 4)]
     alive = np.zeros(len(rows), np.bool_)
-    graph = PathGraph(RADIUS, 0.05, 0.012)
-    graph.set_pieces(np.zeros((0, 4)), np.zeros(0, np.int64))
+    graph = PathGraph(RADIUS, 0.05, 0.012, SLACK)
     for i in range(0, len(rows), 4):
         fresh = np.arange(i, min(i + 4, len(rows)))
         alive[fresh] = True
         graph.set_walls(rows, alive, fresh)
-        graph.refresh(ALL, SLACK)
-        ends = graph.ends[: graph.n_edges][graph.state[: graph.n_edges] != DEAD]
+        graph.connect()
+        ends = np.concatenate((edges(graph), graph.blocked))
         ways = shapely.linestrings(np.stack((graph.position[ends[:, 0]], graph.position[ends[:, 1]]), axis=1))
         assert (shapely.distance(lines_of(rows[alive]), ways) > RADIUS).all()
-        corners = graph.position[: graph.n_vertices][graph.kind[: graph.n_vertices] == 0]
+        corners = graph.position[: graph.n_vertices][graph.kind[: graph.n_vertices] == CORNER]
         clearance = shapely.distance(lines_of(rows[alive]), shapely.points(corners))
         assert (clearance >= RADIUS + 0.012 - 0.009).all()
 

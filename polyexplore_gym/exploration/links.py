@@ -1,0 +1,331 @@
+"""Links: the edges of the exploration graph, kept at their vertices, and what opens, blocks and cuts them.
+
+Walls cut an edge for good; open edges of the explored area (the boundary to the unknown) block it only as long as they
+are there. Blocked edges are kept in a list of their own, so that searches never meet them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL, tangent
+from polyexplore_gym.exploration.segments import crossing_free, point_segment_distance, segment_distance, sweep_free
+
+_MAX_LEAF_EDGE = 15.0
+_MAX_EDGE = 10.0
+"""Longest edges of the graph, to leaves and between corners, m."""
+_TRAIL_EDGE = 0.6
+"""Longest edge (m) from the way driven to anything else."""
+_BREATH = 0.002
+"""A wall refitted nearer by this much (m) does not cut an edge: it would flicker."""
+
+
+class Links(NamedTuple):
+    """Half-edges by vertex: those of v are `count[v]` rows from `first[v]` on, in a block with room for `room[v]`."""
+
+    first: np.ndarray
+    """(v,)"""
+    count: np.ndarray
+    """(v,)"""
+    room: np.ndarray
+    """(v,)"""
+    target: np.ndarray
+    """(h,) the vertex at the other end"""
+    cost: np.ndarray
+    """(h,) length, m"""
+    want: np.ndarray
+    """(h,) clearance that the edge needs, m"""
+
+    @classmethod
+    def none(cls, vertices: int, rows: int) -> Links:
+        """Nothing yet, with space for so many vertices and half-edges."""
+        z = np.zeros(vertices, np.int64)
+        return cls(z, z.copy(), z.copy(), np.zeros(rows, np.int32), np.zeros(rows), np.zeros(rows))
+
+
+@njit(cache=True)
+def insert(pairs, length, wants, links, used):
+    """Add edges (e, 2). Returns the rows then in use; or, adding nothing, minus the rows that were too few."""
+    more = np.zeros(links.first.size, np.int64)
+    for e in range(pairs.shape[0]):
+        more[pairs[e, 0]] += 1
+        more[pairs[e, 1]] += 1
+    extra = 0
+    for v in range(more.size):
+        if links.count[v] + more[v] > links.room[v]:
+            size = 8
+            while size < links.count[v] + more[v]:
+                size *= 2
+            more[v] = size
+            extra += size
+        else:
+            more[v] = 0
+    if used + extra > links.target.size:
+        return -extra
+    for v in range(more.size):
+        if more[v] == 0:
+            continue
+        a = links.first[v]
+        for h in range(links.count[v]):
+            links.target[used + h] = links.target[a + h]
+            links.cost[used + h] = links.cost[a + h]
+            links.want[used + h] = links.want[a + h]
+        links.first[v] = used
+        links.room[v] = more[v]
+        used += more[v]
+    for e in range(pairs.shape[0]):
+        for side in range(2):
+            v = pairs[e, side]
+            h = links.first[v] + links.count[v]
+            links.target[h] = pairs[e, 1 - side]
+            links.cost[h] = length[e]
+            links.want[h] = wants[e]
+            links.count[v] += 1
+    return used
+
+
+@njit(cache=True)
+def repack(old, new):
+    """Copy all blocks one behind the other from `old` to `new`. Returns the rows then in use."""
+    used = 0
+    for v in range(old.first.size):
+        new.first[v] = used
+        new.count[v] = old.count[v]
+        if old.count[v] == 0:
+            continue
+        for h in range(old.count[v]):
+            new.target[used + h] = old.target[old.first[v] + h]
+            new.cost[used + h] = old.cost[old.first[v] + h]
+            new.want[used + h] = old.want[old.first[v] + h]
+        size = 8
+        while size < old.count[v]:
+            size *= 2
+        new.room[v] = size
+        used += size
+    return used
+
+
+@njit(cache=True)
+def _cut_row(v, h, links):
+    last = links.first[v] + links.count[v] - 1
+    links.target[h] = links.target[last]
+    links.cost[h] = links.cost[last]
+    links.want[h] = links.want[last]
+    links.count[v] -= 1
+
+
+@njit(cache=True)
+def _cut(v, w, links):
+    """Take one half-edge v-w out."""
+    for h in range(links.first[v], links.first[v] + links.count[v]):
+        if links.target[h] == w:
+            _cut_row(v, h, links)
+            return
+
+
+@njit(cache=True)
+def isolate(vertices, links):
+    """Take all edges of the vertices out."""
+    for v in vertices:
+        for h in range(links.first[v], links.first[v] + links.count[v]):
+            _cut(links.target[h], v, links)
+        links.count[v] = 0
+
+
+@njit(cache=True, inline="always")
+def _hit(ax, ay, bx, by, length, want, walls, discs):
+    """Whether a wall comes nearer to a-b than `want`; `discs` (m, 3) hold the inflated walls."""
+    ux = (bx - ax) / max(length, 1e-9)
+    uy = (by - ay) / max(length, 1e-9)
+    for w in range(walls.shape[0]):
+        cx = discs[w, 0] - ax
+        cy = discs[w, 1] - ay
+        if abs(ux * cy - uy * cx) > discs[w, 2]:
+            continue
+        if abs(ux * cx + uy * cy - 0.5 * length) > discs[w, 2] + 0.5 * length:
+            continue
+        if segment_distance(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < want - _BREATH:
+            return True
+    return False
+
+
+@njit(cache=True)
+def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls, need):
+    """Remove the corners and edges that new walls (m, 4) come too near to, and all edges of vertices that are gone.
+
+    Returns the open edges (k, 2) that were cut, and which of the `blocked` ones (b, 2) are left.
+    """
+    cut = np.empty((256, 2), np.int64)
+    count = 0
+    discs = np.empty((walls.shape[0], 3))
+    x0 = y0 = math.inf
+    x1 = y1 = -math.inf
+    for w in range(walls.shape[0]):
+        discs[w, 0] = 0.5 * (walls[w, 0] + walls[w, 2])
+        discs[w, 1] = 0.5 * (walls[w, 1] + walls[w, 3])
+        discs[w, 2] = 0.5 * math.hypot(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + need
+        x0 = min(x0, walls[w, 0] - need, walls[w, 2] - need)
+        x1 = max(x1, walls[w, 0] + need, walls[w, 2] + need)
+        y0 = min(y0, walls[w, 1] - need, walls[w, 3] - need)
+        y1 = max(y1, walls[w, 1] + need, walls[w, 3] + need)
+    for v in range(n_vertices):
+        x = position[v, 0]
+        y = position[v, 1]
+        if kind[v] == CORNER and shape[v, 6] < TRAIL and x0 <= x <= x1 and y0 <= y <= y1:
+            for w in range(walls.shape[0]):
+                if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.008:
+                    kind[v] = -1
+                    break
+        if kind[v] < 0 and links.count[v] > 0:
+            while cut.shape[0] < count + links.count[v]:
+                cut = np.concatenate((cut, np.empty_like(cut)))
+            for h in range(links.first[v], links.first[v] + links.count[v]):
+                cut[count, 0] = v
+                cut[count, 1] = links.target[h]
+                count += 1
+                _cut(links.target[h], v, links)
+            links.count[v] = 0
+    keep = np.ones(blocked.shape[0], np.bool_)
+    for e in range(blocked.shape[0]):
+        u = blocked[e, 0]
+        v = blocked[e, 1]
+        if kind[u] < 0 or kind[v] < 0:
+            keep[e] = False
+            continue
+        ax, ay = position[u]
+        bx, by = position[v]
+        if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
+            keep[e] = not _hit(ax, ay, bx, by, math.hypot(bx - ax, by - ay), blocked_want[e], walls, discs)
+    for u in range(n_vertices):
+        ax = position[u, 0]
+        ay = position[u, 1]
+        far = _MAX_LEAF_EDGE
+        if links.count[u] == 0 or ax < x0 - far or ax > x1 + far or ay < y0 - far or ay > y1 + far:
+            continue
+        h = links.first[u]
+        while h < links.first[u] + links.count[u]:
+            v = links.target[h]
+            bx = position[v, 0]
+            by = position[v, 1]
+            if (
+                v > u
+                and max(ax, bx) >= x0
+                and min(ax, bx) <= x1
+                and max(ay, by) >= y0
+                and min(ay, by) <= y1
+                and _hit(ax, ay, bx, by, links.cost[h], links.want[h], walls, discs)
+            ):
+                if count == cut.shape[0]:
+                    cut = np.concatenate((cut, np.empty_like(cut)))
+                cut[count, 0] = u
+                cut[count, 1] = v
+                count += 1
+                _cut(v, u, links)
+                _cut_row(u, h, links)
+            else:
+                h += 1
+    return cut[:count].copy(), keep
+
+
+@njit(cache=True)
+def unblocked(blocked, position, kind, box, pieces, p_start, p_items, owner, vertex_owner, slack):
+    """Which of the blocked edges (b, 2) that meet `box` (x0, y0, x1, y1) no open edge crosses any more."""
+    free = np.zeros(blocked.shape[0], np.bool_)
+    for e in range(blocked.shape[0]):
+        u = blocked[e, 0]
+        v = blocked[e, 1]
+        ax, ay = position[u]
+        bx, by = position[v]
+        if max(ax, bx) < box[0] or min(ax, bx) > box[2] or max(ay, by) < box[1] or min(ay, by) > box[3]:
+            continue
+        free[e] = crossing_free(
+            ax, ay, bx, by, pieces, p_start, p_items, owner, vertex_owner[u], vertex_owner[v],
+            slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
+        )  # fmt: skip
+    return free
+
+
+@njit(cache=True)
+def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, pieces, p_start, p_items, owner,
+            vertex_owner, need, relaxed, slack):  # fmt: skip
+    """New edges between the `fresh` vertices and all others: (e, 2) vertices, lengths, needs, and which are open.
+
+    `relaxed[v]` is the clearance that a leaf can offer where it stands (a bumped robot may stand
+    nearer to a wall than paths do); `slack` how near (m) to a leaf an open edge may be crossed.
+    """
+    capacity = 256
+    pairs = np.empty((capacity, 2), np.int64)
+    length = np.empty(capacity)
+    wants = np.empty(capacity)
+    free = np.empty(capacity, np.bool_)
+    count = 0
+    rank = np.full(n_vertices, -1, np.int64)
+    for i in range(fresh.size):
+        rank[fresh[i]] = i
+    for i in range(fresh.size):
+        u = fresh[i]
+        if kind[u] < 0:
+            continue
+        ux = position[u, 0]
+        uy = position[u, 1]
+        for v in range(n_vertices):
+            dx = position[v, 0] - ux
+            dy = position[v, 1] - uy
+            if abs(dx) > _MAX_LEAF_EDGE or abs(dy) > _MAX_LEAF_EDGE or kind[v] < 0 or rank[v] > i or v == u:
+                continue
+            d = math.hypot(dx, dy)
+            if d > (_MAX_LEAF_EDGE if kind[u] == LEAF or kind[v] == LEAF else _MAX_EDGE):
+                continue
+            if d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= TRAIL:
+                continue
+            d1 = max(d, 1e-9)
+            if kind[u] == CORNER and not tangent(dx / d1, dy / d1, d, ux, uy, shape[u]):
+                continue
+            if kind[v] == CORNER and not tangent(dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape[v]):
+                continue
+            want = min(need, relaxed[u], relaxed[v])
+            if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
+                continue
+            if count == capacity:
+                capacity *= 2
+                pairs = np.concatenate((pairs, np.empty((count, 2), np.int64)))
+                length = np.concatenate((length, np.empty(count)))
+                wants = np.concatenate((wants, np.empty(count)))
+                free = np.concatenate((free, np.empty(count, np.bool_)))
+            pairs[count, 0] = u
+            pairs[count, 1] = v
+            length[count] = d
+            wants[count] = want
+            free[count] = crossing_free(
+                ux, uy, position[v, 0], position[v, 1], pieces, p_start, p_items, owner,
+                vertex_owner[u], vertex_owner[v],
+                slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
+            )  # fmt: skip
+            count += 1
+    return pairs[:count].copy(), length[:count].copy(), wants[:count].copy(), free[:count].copy()
+
+
+@njit(cache=True)
+def reachable(root, links, kind):
+    """Which vertices an open path joins to `root`."""
+    seen = np.zeros(links.first.size, np.bool_)
+    stack = np.empty(seen.size, np.int64)
+    stack[0] = root
+    seen[root] = True
+    size = 1
+    while size > 0:
+        size -= 1
+        v = stack[size]
+        if kind[v] == LEAF and v != root:
+            continue
+        for h in range(links.first[v], links.first[v] + links.count[v]):
+            w = links.target[h]
+            if not seen[w]:
+                seen[w] = True
+                stack[size] = w
+                size += 1
+    return seen
