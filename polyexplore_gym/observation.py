@@ -6,11 +6,13 @@ of `edges` and of `path_lengths` is action i. Padding is 0.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from gymnasium import spaces
+from numba import njit
 
 from polyexplore_gym.config import ObservationConfig
 from polyexplore_gym.exploration import ExplorationMap
@@ -82,88 +84,111 @@ def observe(
         rows = np.sort(np.lexsort((rows, c.path_length))[:n])
     k = len(rows)
     frame = pose if config.relative else np.zeros(3)
-    arrays = {
-        "pose": pose.astype(np.float32),
-        "pose_covariance": np.clip(covariance, -_VARIANCE, _VARIANCE).astype(np.float32),
-        "max_range": np.array([min(max_range, LIMIT)], np.float32),
-        "edges": _padded(_seen_from(c.ends[rows].reshape(-1, 2), frame).reshape(-1, 4), n, 4),
-        "node_position": _padded(_seen_from(c.node[rows, :2], frame), n, 2),
-        "node_heading": _padded(_wrapped(c.node[rows, 2] - frame[2]), n),
-        "node_path_length": _padded(np.minimum(c.path_length[rows], LIMIT), n),
-        "node_edge_length": _padded(c.length[rows], n),
-        "node_gain": _padded(c.gain[rows], n),
-        "node_kind": _padded(c.kind[rows] - 1.0, n),
-        "node_visits": _padded(c.visits[rows], n),
-        "node_mask": np.zeros(n, np.int8),
-        "action_mask": np.zeros(n, np.int8),
-        "path_lengths": np.zeros((n, n), np.float32),
-    }
+    arrays: dict[str, np.ndarray] = {key: np.zeros(shape, dtype) for key, shape, dtype in _layout(n, m)}
+    arrays["pose"][:] = pose
+    arrays["pose_covariance"][:] = np.clip(covariance, -_VARIANCE, _VARIANCE)
+    arrays["max_range"][:] = min(max_range, LIMIT)
     arrays["node_mask"][:k] = 1
-    arrays["action_mask"][:k] = np.isfinite(c.path_length[rows])
+    _nodes(
+        rows, c.ends, c.node, c.path_length, c.length, c.gain, c.kind, c.visits, frame, arrays["edges"],
+        arrays["node_position"], arrays["node_heading"], arrays["node_path_length"], arrays["node_edge_length"],
+        arrays["node_gain"], arrays["node_kind"], arrays["node_visits"], arrays["action_mask"],
+    )  # fmt: skip
     if config.pairwise and k:
-        arrays["path_lengths"][:k, :k] = np.minimum(exploration.path_lengths(rows), LIMIT)
-    arrays["lines"], arrays["line_mask"], cut_lines = _lines(lines, pose, frame, m)
+        np.minimum(exploration.path_lengths(rows), LIMIT, out=arrays["path_lengths"][:k, :k], casting="same_kind")
+    which = np.flatnonzero(lines.alive)
+    cut_lines = max(len(which) - m, 0)
+    if cut_lines:
+        which = np.sort(np.argsort(_distances(lines.segments, which, pose), kind="stable")[:m])
+        which = np.flatnonzero(lines.alive)[which]
+    arrays["line_mask"][: len(which)] = 1
+    _lines(which, lines.segments, lines.line, lines.alpha, lines.rho, lines.covariance, frame, arrays["lines"])
     return Observed(arrays, rows, len(c) - k, cut_lines)
 
 
-def _lines(lines: LineMap, pose: np.ndarray, frame: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """The segments nearest to the robot: end points, rho, alpha and their covariance (zero for fragments).
+@functools.cache
+def _layout(n: int, m: int) -> tuple[tuple[str, tuple[int, ...], type], ...]:
+    """Name, shape and type of every array of the space."""
+    spaces_of = space(ObservationConfig(max_nodes=n, max_lines=m)).spaces
+    return tuple((key, box.shape, box.dtype.type) for key, box in spaces_of.items())  # type: ignore[misc, union-attr]
 
-    Which of them, and how many were cut.
-    """
-    rows = np.flatnonzero(lines.alive)
-    cut = max(len(rows) - m, 0)
-    segments = lines.segments[rows]
-    if cut:
-        keep = np.sort(np.argsort(_distance(segments, pose), kind="stable")[:m])
-        rows, segments = rows[keep], segments[keep]
-    k = len(rows)
-    out = np.zeros((m, 9), np.float32)
-    mask = np.zeros(m, np.int8)
-    mask[:k] = 1
-    out[:k, :4] = _seen_from(segments.reshape(-1, 2), frame).reshape(-1, 4)
-    fitted = np.flatnonzero(lines.line[rows] >= 0)
-    of = lines.line[rows[fitted]]
-    alpha, rho, p = lines.alpha[of], lines.rho[of], lines.covariance[of]
-    paa, par, prr = p[:, 0, 0], p[:, 0, 1], p[:, 1, 1]
-    if frame.any():
+
+@njit(cache=True, inline="always")
+def _wrapped(angle: float) -> float:
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+@njit(cache=True)
+def _nodes(rows, ends, node, path_length, length, gain, kind, visits, frame, edges, position, heading, reach, size,
+           angle, label, count, valid):  # fmt: skip
+    """Fill in what describes the nodes, as seen from `frame` (3,)."""
+    c = math.cos(frame[2])
+    s = math.sin(frame[2])
+    for i in range(rows.size):
+        r = rows[i]
+        for e in range(2):
+            dx = ends[r, 2 * e] - frame[0]
+            dy = ends[r, 2 * e + 1] - frame[1]
+            edges[i, 2 * e] = c * dx + s * dy
+            edges[i, 2 * e + 1] = c * dy - s * dx
+        dx = node[r, 0] - frame[0]
+        dy = node[r, 1] - frame[1]
+        position[i, 0] = c * dx + s * dy
+        position[i, 1] = c * dy - s * dx
+        heading[i] = _wrapped(node[r, 2] - frame[2])
+        reach[i] = min(path_length[r], LIMIT)
+        size[i] = length[r]
+        angle[i] = gain[r]
+        label[i] = kind[r] - 1.0
+        count[i] = visits[r]
+        valid[i] = path_length[r] < math.inf
+
+
+@njit(cache=True)
+def _lines(which, segments, line, alpha, rho, covariance, frame, out):
+    """Fill in the segments `which`: end points, rho, alpha and their covariance (zero for fragments)."""
+    c = math.cos(frame[2])
+    s = math.sin(frame[2])
+    for i in range(which.size):
+        r = which[i]
+        for e in range(2):
+            dx = segments[r, 2 * e] - frame[0]
+            dy = segments[r, 2 * e + 1] - frame[1]
+            out[i, 2 * e] = c * dx + s * dy
+            out[i, 2 * e + 1] = c * dy - s * dx
+        of = line[r]
+        if of < 0:
+            continue
         # The line about the robot: DESIGN section 5 inverted, H = [[1, 0], [-dpsi, 1]].
-        ca, sa = np.cos(alpha), np.sin(alpha)
-        shift = -(frame[1] * ca - frame[0] * sa)
-        rho = rho - frame[0] * ca - frame[1] * sa
-        prr = prr + 2.0 * shift * par + shift * shift * paa
-        par = par + shift * paa
-        flip = rho < 0
-        alpha = _wrapped(alpha - frame[2] + np.where(flip, math.pi, 0.0))
-        rho = np.abs(rho)
-        par = np.where(flip, -par, par)
-    out[fitted, 4] = rho
-    out[fitted, 5] = alpha
-    out[fitted, 6:] = np.clip(np.stack((paa, par, prr), axis=1), -_VARIANCE, _VARIANCE)
-    return out, mask, cut
+        ca = math.cos(alpha[of])
+        sa = math.sin(alpha[of])
+        shift = frame[0] * sa - frame[1] * ca
+        about = rho[of] - frame[0] * ca - frame[1] * sa
+        paa = covariance[of, 0, 0]
+        par = covariance[of, 0, 1] + shift * paa
+        prr = covariance[of, 1, 1] + 2.0 * shift * covariance[of, 0, 1] + shift * shift * paa
+        normal = alpha[of] - frame[2]
+        if about < 0.0:
+            about = -about
+            par = -par
+            normal += math.pi
+        out[i, 4] = about
+        out[i, 5] = _wrapped(normal)
+        out[i, 6] = min(paa, _VARIANCE)
+        out[i, 7] = min(max(par, -_VARIANCE), _VARIANCE)
+        out[i, 8] = min(prr, _VARIANCE)
 
 
-def _padded(values: np.ndarray, *shape: int) -> np.ndarray:
-    out = np.zeros(shape, np.float32)
-    out[: len(values)] = values
+@njit(cache=True)
+def _distances(segments, which, pose):
+    """Distance (k,) of the segments `which` from the position of a pose."""
+    out = np.empty(which.size)
+    for i in range(which.size):
+        r = which[i]
+        ax = segments[r, 0] - pose[0]
+        ay = segments[r, 1] - pose[1]
+        dx = segments[r, 2] - segments[r, 0]
+        dy = segments[r, 3] - segments[r, 1]
+        along = min(max(-(ax * dx + ay * dy) / max(dx * dx + dy * dy, 1e-12), 0.0), 1.0)
+        out[i] = math.hypot(ax + along * dx, ay + along * dy)
     return out
-
-
-def _seen_from(points: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Points (k, 2) of the map frame in the frame of a pose."""
-    if not frame.any():
-        return points
-    c, s = math.cos(frame[2]), math.sin(frame[2])
-    x, y = points[:, 0] - frame[0], points[:, 1] - frame[1]
-    return np.stack((c * x + s * y, c * y - s * x), axis=1)
-
-
-def _distance(segments: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Distance (k,) of segments (k, 4) from the position of a pose."""
-    a, d = segments[:, :2] - pose[:2], segments[:, 2:] - segments[:, :2]
-    along = np.clip(-(a * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-12), 0.0, 1.0)
-    return np.hypot(*(a + along[:, None] * d).T)
-
-
-def _wrapped(angles: np.ndarray) -> np.ndarray:
-    return math.pi - (math.pi - angles) % (2.0 * math.pi)

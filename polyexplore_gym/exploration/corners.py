@@ -320,18 +320,18 @@ def distinct(candidates, forms, position, shape, kind, n_vertices):
 
 
 @njit(cache=True, inline="always")
-def tangent(dx, dy, length, x, y, shape):
-    """Whether a leg in direction d (a unit vector) at a corner vertex can be part of a taut path."""
+def tangent(dx, dy, length, x, y, shape, v):
+    """Whether a leg in direction d (a unit vector) at corner vertex v can be part of a taut path."""
     # Short legs turn round one corner, whose vertices need not stand just where they should.
-    if shape[6] >= OPEN_SPACE or length <= _SHORT:
+    if shape[v, 6] >= OPEN_SPACE or length <= _SHORT:
         return True
-    rx = x - shape[0]
-    ry = y - shape[1]
-    if abs(dx * rx + dy * ry) > shape[6] * math.hypot(rx, ry):
+    rx = x - shape[v, 0]
+    ry = y - shape[v, 1]
+    if abs(dx * rx + dy * ry) > shape[v, 6] * math.hypot(rx, ry):
         return False
     side = dy * rx - dx * ry
-    c1 = dx * shape[3] - dy * shape[2]
-    c2 = dx * shape[5] - dy * shape[4]
+    c1 = dx * shape[v, 3] - dy * shape[v, 2]
+    c2 = dx * shape[v, 5] - dy * shape[v, 4]
     if side > 0.0:
         return c1 >= -_LEEWAY and c2 >= -_LEEWAY
     return c1 <= _LEEWAY and c2 <= _LEEWAY

@@ -48,7 +48,7 @@ def _leave(v, head, after, before, inside):
 @njit(cache=True)
 def _settle(dist, parent, source, low, high, head, after, before, inside, links, kind):
     """Empty the queue, whose buckets from `low` to `high` hold vertices; leaves but the source are not gone through."""
-    first, count, _, target, cost, _ = links
+    first, degree, _, target, cost, _ = links
     b = low
     while b <= high:
         v = head[b]
@@ -59,7 +59,7 @@ def _settle(dist, parent, source, low, high, head, after, before, inside, links,
         d = dist[v]
         if kind[v] == LEAF and v != source:
             continue
-        for h in range(first[v], first[v] + count[v]):
+        for h in range(first[v], first[v] + degree[v]):
             w = target[h]
             if d + cost[h] < dist[w]:
                 dist[w] = d + cost[h]
@@ -112,7 +112,7 @@ def repair(dist, parent, sources, cut, added, length, links, kind):
         while i < n_hit:
             v = affected[i]
             i += 1
-            for h in range(links.first[v], links.first[v] + links.count[v]):
+            for h in range(links.first[v], links.first[v] + links.degree[v]):
                 w = links.target[h]
                 if p[w] == v and d[w] < math.inf:
                     p[w] = -1
@@ -123,7 +123,7 @@ def repair(dist, parent, sources, cut, added, length, links, kind):
         high = -1
         for i in range(n_hit):
             v = affected[i]
-            for h in range(links.first[v], links.first[v] + links.count[v]):
+            for h in range(links.first[v], links.first[v] + links.degree[v]):
                 w = links.target[h]
                 if (kind[w] != LEAF or w == s) and d[w] + links.cost[h] < d[v]:
                     d[v] = d[w] + links.cost[h]

@@ -25,11 +25,11 @@ _BREATH = 0.002
 
 
 class Links(NamedTuple):
-    """Half-edges by vertex: those of v are `count[v]` rows from `first[v]` on, in a block with room for `room[v]`."""
+    """Half-edges by vertex: those of v are `degree[v]` rows from `first[v]` on, in a block with room for `room[v]`."""
 
     first: np.ndarray
     """(v,)"""
-    count: np.ndarray
+    degree: np.ndarray
     """(v,)"""
     room: np.ndarray
     """(v,)"""
@@ -56,9 +56,9 @@ def insert(pairs, length, wants, links, used):
         more[pairs[e, 1]] += 1
     extra = 0
     for v in range(more.size):
-        if links.count[v] + more[v] > links.room[v]:
+        if links.degree[v] + more[v] > links.room[v]:
             size = 8
-            while size < links.count[v] + more[v]:
+            while size < links.degree[v] + more[v]:
                 size *= 2
             more[v] = size
             extra += size
@@ -70,7 +70,7 @@ def insert(pairs, length, wants, links, used):
         if more[v] == 0:
             continue
         a = links.first[v]
-        for h in range(links.count[v]):
+        for h in range(links.degree[v]):
             links.target[used + h] = links.target[a + h]
             links.cost[used + h] = links.cost[a + h]
             links.want[used + h] = links.want[a + h]
@@ -80,11 +80,11 @@ def insert(pairs, length, wants, links, used):
     for e in range(pairs.shape[0]):
         for side in range(2):
             v = pairs[e, side]
-            h = links.first[v] + links.count[v]
+            h = links.first[v] + links.degree[v]
             links.target[h] = pairs[e, 1 - side]
             links.cost[h] = length[e]
             links.want[h] = wants[e]
-            links.count[v] += 1
+            links.degree[v] += 1
     return used
 
 
@@ -94,15 +94,15 @@ def repack(old, new):
     used = 0
     for v in range(old.first.size):
         new.first[v] = used
-        new.count[v] = old.count[v]
-        if old.count[v] == 0:
+        new.degree[v] = old.degree[v]
+        if old.degree[v] == 0:
             continue
-        for h in range(old.count[v]):
+        for h in range(old.degree[v]):
             new.target[used + h] = old.target[old.first[v] + h]
             new.cost[used + h] = old.cost[old.first[v] + h]
             new.want[used + h] = old.want[old.first[v] + h]
         size = 8
-        while size < old.count[v]:
+        while size < old.degree[v]:
             size *= 2
         new.room[v] = size
         used += size
@@ -111,17 +111,17 @@ def repack(old, new):
 
 @njit(cache=True)
 def _cut_row(v, h, links):
-    last = links.first[v] + links.count[v] - 1
+    last = links.first[v] + links.degree[v] - 1
     links.target[h] = links.target[last]
     links.cost[h] = links.cost[last]
     links.want[h] = links.want[last]
-    links.count[v] -= 1
+    links.degree[v] -= 1
 
 
 @njit(cache=True)
 def _cut(v, w, links):
     """Take one half-edge v-w out."""
-    for h in range(links.first[v], links.first[v] + links.count[v]):
+    for h in range(links.first[v], links.first[v] + links.degree[v]):
         if links.target[h] == w:
             _cut_row(v, h, links)
             return
@@ -131,9 +131,9 @@ def _cut(v, w, links):
 def isolate(vertices, links):
     """Take all edges of the vertices out."""
     for v in vertices:
-        for h in range(links.first[v], links.first[v] + links.count[v]):
+        for h in range(links.first[v], links.first[v] + links.degree[v]):
             _cut(links.target[h], v, links)
-        links.count[v] = 0
+        links.degree[v] = 0
 
 
 @njit(cache=True, inline="always")
@@ -180,15 +180,15 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
                 if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.008:
                     kind[v] = -1
                     break
-        if kind[v] < 0 and links.count[v] > 0:
-            while cut.shape[0] < count + links.count[v]:
+        if kind[v] < 0 and links.degree[v] > 0:
+            while cut.shape[0] < count + links.degree[v]:
                 cut = np.concatenate((cut, np.empty_like(cut)))
-            for h in range(links.first[v], links.first[v] + links.count[v]):
+            for h in range(links.first[v], links.first[v] + links.degree[v]):
                 cut[count, 0] = v
                 cut[count, 1] = links.target[h]
                 count += 1
                 _cut(links.target[h], v, links)
-            links.count[v] = 0
+            links.degree[v] = 0
     keep = np.ones(blocked.shape[0], np.bool_)
     for e in range(blocked.shape[0]):
         u = blocked[e, 0]
@@ -196,18 +196,20 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
         if kind[u] < 0 or kind[v] < 0:
             keep[e] = False
             continue
-        ax, ay = position[u]
-        bx, by = position[v]
+        ax = position[u, 0]
+        ay = position[u, 1]
+        bx = position[v, 0]
+        by = position[v, 1]
         if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
             keep[e] = not _hit(ax, ay, bx, by, math.hypot(bx - ax, by - ay), blocked_want[e], walls, discs)
     for u in range(n_vertices):
         ax = position[u, 0]
         ay = position[u, 1]
         far = _MAX_LEAF_EDGE
-        if links.count[u] == 0 or ax < x0 - far or ax > x1 + far or ay < y0 - far or ay > y1 + far:
+        if links.degree[u] == 0 or ax < x0 - far or ax > x1 + far or ay < y0 - far or ay > y1 + far:
             continue
         h = links.first[u]
-        while h < links.first[u] + links.count[u]:
+        while h < links.first[u] + links.degree[u]:
             v = links.target[h]
             bx = position[v, 0]
             by = position[v, 1]
@@ -238,8 +240,10 @@ def unblocked(blocked, position, kind, box, pieces, p_start, p_items, owner, ver
     for e in range(blocked.shape[0]):
         u = blocked[e, 0]
         v = blocked[e, 1]
-        ax, ay = position[u]
-        bx, by = position[v]
+        ax = position[u, 0]
+        ay = position[u, 1]
+        bx = position[v, 0]
+        by = position[v, 1]
         if max(ax, bx) < box[0] or min(ax, bx) > box[2] or max(ay, by) < box[1] or min(ay, by) > box[3]:
             continue
         free[e] = crossing_free(
@@ -283,9 +287,9 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             if d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= TRAIL:
                 continue
             d1 = max(d, 1e-9)
-            if kind[u] == CORNER and not tangent(dx / d1, dy / d1, d, ux, uy, shape[u]):
+            if kind[u] == CORNER and not tangent(dx / d1, dy / d1, d, ux, uy, shape, u):
                 continue
-            if kind[v] == CORNER and not tangent(dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape[v]):
+            if kind[v] == CORNER and not tangent(dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape, v):
                 continue
             want = min(need, relaxed[u], relaxed[v])
             if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
@@ -322,7 +326,7 @@ def reachable(root, links, kind):
         v = stack[size]
         if kind[v] == LEAF and v != root:
             continue
-        for h in range(links.first[v], links.first[v] + links.count[v]):
+        for h in range(links.first[v], links.first[v] + links.degree[v]):
             w = links.target[h]
             if not seen[w]:
                 seen[w] = True

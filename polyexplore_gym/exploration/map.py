@@ -293,7 +293,7 @@ class ExplorationMap:
         self._start = self._way_out(float(pose[0]), float(pose[1]), came)
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
         reach = self.sensor.max_range
-        local = ((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach)).all(axis=1)
+        local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
         self._place(np.flatnonzero(local))
         self._update_paths()
         if came is not None:

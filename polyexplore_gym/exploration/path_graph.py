@@ -271,7 +271,7 @@ class PathGraph:
     def neighbours(self, v: int) -> np.ndarray:
         """The vertices (k,) that open edges join to v."""
         first = self.links.first[v]
-        return self.links.target[first : first + self.links.count[v]]
+        return self.links.target[first : first + self.links.degree[v]]
 
     def connect(self) -> None:
         """Join the vertices that came since the last call to all that they see."""
@@ -300,7 +300,7 @@ class PathGraph:
 
     def _make_room(self, vertices: int, more: int) -> None:
         """Move all edges to new tables, with space for `more` half-edges beside twice those in use."""
-        rows = int(self.links.count.sum())
+        rows = int(self.links.degree.sum())
         links = Links.none(vertices, 4 * rows + 2 * more + 16 * self.n_vertices)
         self._used = repack(self.links, links)
         self.links = links
@@ -348,7 +348,7 @@ class PathGraph:
     def recycle(self) -> None:
         """Free the indices of dead vertices. Call after `repair`."""
         if len(self.blocked):
-            self._keep_blocked((self.kind[self.blocked] >= 0).all(axis=1))
+            self._keep_blocked(np.all(self.kind[self.blocked] >= 0, axis=1))
         self._free_ids = np.flatnonzero(self.kind[: self.n_vertices] < 0)
 
     def reachable(self, root: int) -> np.ndarray:

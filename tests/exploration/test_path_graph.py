@@ -174,7 +174,7 @@ def exported(graph):
     out.add_nodes_from(np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist())
     for u, v in edges(graph).tolist():
         first = graph.links.first[u]
-        length = float(graph.links.cost[first : first + graph.links.count[u]][graph.neighbours(u) == v][0])
+        length = float(graph.links.cost[first : first + graph.links.degree[u]][graph.neighbours(u) == v][0])
         assert length == pytest.approx(math.dist(graph.position[u], graph.position[v]))
         out.add_edge(u, v, weight=length)
     return out
