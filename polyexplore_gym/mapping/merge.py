@@ -23,7 +23,7 @@ from polyexplore_gym.mapping.slots import (
 )
 
 MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
-SAME_SIDE = 1.7  # rad; a segment facing farther away than this does not stand for another
+STANDS_FOR = 0.5  # rad; a segment facing farther away does not stand for another: short walls at corners stay
 COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
 LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end along its line
@@ -222,7 +222,7 @@ def lay(
 def clear_covered(
     line: int, rows: Rows, lines: Lines, grid: Grid, slots: Slots, sigma_range: float, found: np.ndarray
 ) -> None:
-    """Remove fragments, and shorter segments seen from the same side, that the line's changed rows cover."""
+    """Remove fragments, and shorter segments that face the same way, that the line's changed rows cover."""
     _, alpha, _ = oriented(lines, line)
     row = lines.first[line]
     while row >= 0:
@@ -237,7 +237,7 @@ def clear_covered(
                 if rows.line[f] == line or math.hypot(g[2] - g[0], g[3] - g[1]) > length:
                     continue
                 _, other, _ = oriented(lines, rows.line[f])
-                if abs(wrap(alpha - other)) > SAME_SIDE:
+                if abs(wrap(alpha - other)) > STANDS_FOR:
                     continue
                 tolerance = COVER + sigma_range + 3.0 * math.hypot(rows.sigma[f], rows.sigma[row])
             if segment_distance(g[0], g[1], w) <= tolerance and segment_distance(g[2], g[3], w) <= tolerance:
@@ -255,7 +255,7 @@ def covered(
     """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a > b if none.
 
     Rows touched first in insert `stamp` that are fragments do not count: they come from the same scan.
-    With any_side False only rows seen from the same side (normal direction side_alpha) count.
+    With any_side False only rows that face the same way (normal direction side_alpha) count.
     """
     tolerance = COVER + 3.0 * sigma
     n = box_query(grid, s, tolerance + 0.5, found)
@@ -274,7 +274,7 @@ def covered(
                     continue
             elif not any_side:
                 _, alpha, _ = oriented(lines, j)
-                if abs(wrap(alpha - side_alpha)) > SAME_SIDE:
+                if abs(wrap(alpha - side_alpha)) > STANDS_FOR:
                     continue
             reach = tolerance if any_side else COVER + sigma_range + 3.0 * math.hypot(sigma, rows.sigma[row])
             if segment_distance(px, py, rows.segments[row]) <= reach:
