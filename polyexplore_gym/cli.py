@@ -393,8 +393,6 @@ def _plan_files(paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def _bench_plots(study: Study, records: list[EpisodeRecord], summary: Summary, options: Bench) -> list[Path]:
-    import numpy as np
-
     from polyexplore_gym.evaluation import plots
 
     figure = plots.coverage_figure(records, reference=options.reference)

@@ -14,7 +14,7 @@ from polyexplore_gym.evaluation.episode import run_episode
 from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
-from polyexplore_gym.evaluation.statistics import coverage_at, resampled_weights
+from polyexplore_gym.evaluation.statistics import coverage_at, mean_band
 from polyexplore_gym.evaluation.summary import Comparison, Summary, completed
 
 if TYPE_CHECKING:
@@ -28,10 +28,8 @@ _INK = "#333333"
 
 def coverage_figure(
     records: Sequence[EpisodeRecord],
-    rng: np.random.Generator,
     *,
     reference: str = "nearest",
-    resamples: int = 1000,
 ) -> Figure:
     """Coverage against the distance driven: mean over the starts, with its 95 % interval over buildings.
 
@@ -64,11 +62,9 @@ def coverage_figure(
                 ]
             )
             color, dash = _style(policies.index(policy))
-            panel.plot(grid, 100 * curves.mean(axis=0), color=color, linestyle=dash, linewidth=1.6, label=policy)
-            if len({r.group for r in runs}) > 1:
-                weights = resampled_weights([r.group for r in runs], [r.stratum for r in runs], rng, resamples)
-                low, high = np.quantile(weights @ curves / weights.sum(axis=1, keepdims=True), [0.025, 0.975], axis=0)
-                panel.fill_between(grid, 100 * low, 100 * high, color=color, alpha=0.12, linewidth=0)
+            mean, low, high = 100 * mean_band(curves, [r.group for r in runs], [r.stratum for r in runs])
+            panel.plot(grid, mean, color=color, linestyle=dash, linewidth=1.6, label=policy)
+            panel.fill_between(grid, low.clip(0, 100), high.clip(0, 100), color=color, alpha=0.12, linewidth=0)
         panel.set_title(f"{placement} ({len(pairs)} starts)", fontsize=10, color=_INK)
         panel.set_xlabel(f"distance / that of {base} until complete" if base else "distance", fontsize=9)
         panel.set_xlim(0.0, grid[-1])

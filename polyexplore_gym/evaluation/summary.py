@@ -28,6 +28,7 @@ from polyexplore_gym.evaluation.statistics import (
     holm,
     interquartile_mean,
     probability_of_improvement,
+    proportion_interval,
     signed_rank_p,
 )
 
@@ -117,7 +118,7 @@ def summarize(
     rng: np.random.Generator,
     *,
     reference: str = "nearest",
-    resamples: int = 5000,
+    resamples: int = 2000,
     confidence: float = 0.95,
 ) -> Summary:
     """The figures of a study's records.
@@ -191,6 +192,7 @@ class _Table:
     ) -> None:
         self._records = records
         self._complete = complete
+        self._confidence = confidence
         self._interval = functools.partial(bootstrap_interval, rng=rng, resamples=resamples, confidence=confidence)
 
     def completed(self, policy: str, placement: str) -> list[Pair]:
@@ -255,7 +257,7 @@ class _Table:
                     len(both),
                     len(set(clusters)),
                     self._interval(ratio, clusters, strata, statistic=geometric_mean),
-                    self._interval(better, clusters, strata),
+                    proportion_interval(better, clusters, confidence=self._confidence),
                     signed_rank_p(np.log(ratio), clusters) if both else float("nan"),
                     float("nan"),
                     tuple(ratio.tolist()),

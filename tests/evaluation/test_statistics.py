@@ -6,90 +6,148 @@ from hypothesis import strategies as st
 
 from polyexplore_gym.evaluation.statistics import (
     area_under_coverage,
+    arithmetic_mean,
     bootstrap_interval,
     coverage_at,
     geometric_mean,
     holm,
     interquartile_mean,
+    mean_band,
     probability_of_improvement,
-    resampled_weights,
+    proportion_band,
+    proportion_interval,
     signed_rank_p,
-    weighted_mean,
 )
 
 
-def ones(values) -> np.ndarray:
-    return np.ones((1, len(values)))
-
-
-def test_interquartile_mean_is_the_trimmed_mean():
+def test_statistics_are_those_of_scipy():
     rng = np.random.default_rng(0)
     for n in (4, 8, 40, 100):
-        values = rng.lognormal(size=n)
-        assert interquartile_mean(values, ones(values))[0] == pytest.approx(scipy.stats.trim_mean(values, 0.25))
+        values = rng.lognormal(size=(3, n))
+        np.testing.assert_allclose(interquartile_mean(values), scipy.stats.trim_mean(values, 0.25, axis=1))
+        np.testing.assert_allclose(geometric_mean(values), scipy.stats.gmean(values, axis=1))
     # By hand: of 1, 2, 9 the middle half is 1/4 of 1, all of 2, 1/4 of 9 (in units of a value).
-    assert interquartile_mean(np.array([9.0, 1.0, 2.0]), np.ones((1, 3)))[0] == pytest.approx((0.25 + 2 + 2.25) / 1.5)
-    assert interquartile_mean(np.array([5.0]), np.ones((1, 1)))[0] == 5.0
+    assert interquartile_mean(np.array([9.0, 1.0, 2.0])) == pytest.approx((0.25 + 2 + 2.25) / 1.5)
+    assert interquartile_mean(np.array([5.0])) == 5.0
 
 
-@settings(max_examples=50, deadline=None)
-@given(st.lists(st.tuples(st.floats(0.1, 100), st.integers(0, 4)), min_size=1, max_size=20), st.integers(0, 2**32))
-def test_weights_count_like_copies(pairs, seed):
-    values, counts = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
-    if counts.sum() == 0:
-        counts[0] = 1
-    copies = np.repeat(values, counts)
-    for statistic in (weighted_mean, geometric_mean, interquartile_mean):
-        weighted = statistic(values, counts[None].astype(float))[0]
-        assert weighted == pytest.approx(statistic(copies, ones(copies))[0], rel=1e-9)
-    assert geometric_mean(copies, ones(copies))[0] == pytest.approx(scipy.stats.gmean(copies), rel=1e-9)
+def twin(values, clusters, strata, rng, statistic, resamples):
+    """`bootstrap_interval` run by run, with the same draws."""
+    log = min(values) > 0
+    y = [float(np.log(v)) if log else float(v) for v in values]
+    names = sorted(set(clusters))
+    runs = {name: [i for i, c in enumerate(clusters) if c == name] for name in names}
+    kind = {name: strata[runs[name][0]] for name in names}
+    alone = [k for k in set(kind.values()) if list(kind.values()).count(k) == 1]
+    kind = {name: "alone" if k in alone else k for name, k in kind.items()}
+    if len(names) - len(set(kind.values())) < 2:
+        kind = dict.fromkeys(names, "all")
+    freedom = len(names) - len(set(kind.values()))
+
+    def centres(y):
+        mean = {name: float(np.mean([y[i] for i in runs[name]])) for name in names}
+        centre = {k: float(np.mean([mean[name] for name in names if kind[name] == k])) for k in set(kind.values())}
+        return centre, float(np.sqrt(sum((mean[name] - centre[kind[name]]) ** 2 for name in names) / freedom))
+
+    centre, spread = centres(y)
+    peers = {name: sum(kind[other] == kind[name] for other in names) for name in names}
+    able = [name for name in names if peers[name] > 1]
+    width = 1.06 * len(able) ** -0.2
+    picks = rng.choice([names.index(name) for name in able], size=(resamples, len(names)))
+    noise = rng.standard_normal((resamples, len(names)))
+    worlds = []
+    for pick, push in zip(picks, noise, strict=True):
+        drawn = [0.0] * len(y)
+        for name, donor, more in zip(names, pick, push, strict=True):
+            giver = names[donor]
+            for at, i in enumerate(runs[name]):
+                source = runs[giver][at % len(runs[giver])]
+                away = (y[source] - centre[kind[giver]]) * np.sqrt(peers[giver] / (peers[giver] - 1))
+                drawn[i] = centre[kind[name]] + (away + width * spread * more) / np.sqrt(1 + width**2)
+        worlds.append(drawn)
+
+    def unit(y):
+        return np.exp(y) if log else np.array(y)
+
+    def scale(figure):
+        return np.log(figure) if log else figure
+
+    truth = scale(statistic(unit(np.ravel(worlds))))
+    errors = [(scale(statistic(unit(world))) - truth) / centres(world)[1] for world in worlds]
+    low, high = np.quantile(errors, [0.025, 0.975])
+    estimate = scale(statistic(np.asarray(values)))
+    return float(unit(estimate - high * spread)), float(unit(estimate - low * spread))
 
 
-def test_interval_agrees_with_scipy():
-    values = np.random.default_rng(1).lognormal(sigma=0.5, size=40)
-    names = [f"plan {i}" for i in range(40)]
-    for statistic, theirs in (
-        (weighted_mean, np.mean),
-        (interquartile_mean, lambda v, axis: scipy.stats.trim_mean(v, 0.25, axis=axis)),
-    ):
-        ours = bootstrap_interval(values, names, [""] * 40, np.random.default_rng(2), statistic, resamples=40_000)
-        expected = scipy.stats.bootstrap(
-            (values,), theirs, n_resamples=40_000, method="percentile", rng=np.random.default_rng(3)
-        ).confidence_interval
-        spread = expected.high - expected.low
-        assert ours.low == pytest.approx(expected.low, abs=0.02 * spread)
-        assert ours.high == pytest.approx(expected.high, abs=0.02 * spread)
-        assert ours.estimate == pytest.approx(float(theirs(values, axis=0)))
+@pytest.mark.parametrize("statistic", [arithmetic_mean, geometric_mean, interquartile_mean])
+@pytest.mark.parametrize("kinds", ["one", "some", "each", "two"])
+def test_the_interval_is_that_of_its_slow_twin(statistic, kinds):
+    rng = np.random.default_rng(1)
+    clusters = [f"b{i}" for i in rng.integers(0, 9, size=20)]
+    strata = {"one": [""] * 20, "some": [f"k{int(c[1]) % 3 if c != 'b8' else 9}" for c in clusters]}
+    strata |= {"each": clusters, "two": [f"k{int(c[1]) // 2}" for c in clusters]}
+    values = rng.lognormal(size=20)
+    samples = [values] if statistic is geometric_mean else [values, np.round(values) - 1.0]
+    for sample in samples:
+        arguments = (sample, clusters, strata[kinds])
+        ours = bootstrap_interval(*arguments, np.random.default_rng(2), statistic, resamples=60)
+        assert (ours.low, ours.high) == pytest.approx(twin(*arguments, np.random.default_rng(2), statistic, 60))
+        assert ours.estimate == pytest.approx(float(statistic(sample)))
 
 
-def test_buildings_are_drawn_whole_and_within_their_stratum():
-    clusters = ["a", "a", "b", "c", "c", "c", "d", "e"]
-    strata = ["home", "home", "home", "office", "office", "office", "office", "shed"]
-    weights = resampled_weights(clusters, strata, np.random.default_rng(0), 4000)
-    assert weights.shape == (4000, 8)
-    assert (weights[:, 0] == weights[:, 1]).all()
-    assert (weights[:, 3] == weights[:, 4]).all()
-    assert (weights[:, 0] + weights[:, 2] == 2).all()  # two homes
-    assert (weights[:, 3] + weights[:, 6] == 2).all()  # two offices
-    assert (weights[:, 7] == 1).all()  # the only shed has nobody to be exchanged with
-    np.testing.assert_allclose(weights.mean(axis=0), 1.0, atol=0.05)
-    # Three strata of one building each are one stratum of three.
-    weights = resampled_weights(["a", "b", "c"], ["x", "y", "z"], np.random.default_rng(0), 4000)
-    assert (weights.sum(axis=1) == 3).all()
-    assert weights.std() > 0.5
+def test_a_normal_sample_has_students_interval():
+    for n in (5, 12, 60):
+        values = np.random.default_rng(n).normal(size=n)
+        names = [f"plan {i}" for i in range(n)]
+        low, high = scipy.stats.ttest_1samp(values, 0.0).confidence_interval()
+        band = mean_band(values[:, None], names, [""] * n)[:, 0]
+        np.testing.assert_allclose(band, [values.mean(), low, high])
+        for ours in (
+            bootstrap_interval(values, names, [""] * n, np.random.default_rng(2), resamples=20_000),
+            bootstrap_interval(
+                np.exp(values), names, [""] * n, np.random.default_rng(2), geometric_mean, resamples=20_000
+            ),
+        ):
+            bounds = (ours.low, ours.high) if ours.low < 0 else (np.log(ours.low), np.log(ours.high))
+            assert bounds == pytest.approx((low, high), abs=0.08 * (high - low))
 
 
-def test_intervals_repeat_and_ask_for_two_buildings():
+def test_buildings_are_drawn_whole():
+    """Two runs a building that are equal tell no more than one; and a stratum's mean shifts nothing."""
+    rng = np.random.default_rng(3)
+    values, names = rng.normal(size=12), [f"b{i:02d}" for i in range(12)]
+    once = bootstrap_interval(values, names, [""] * 12, np.random.default_rng(0))
+    twice = bootstrap_interval(np.repeat(values, 2), np.repeat(names, 2), [""] * 24, np.random.default_rng(0))
+    assert (twice.low, twice.high) == pytest.approx((once.low, once.high))
+    kinds = ["home", "office"] * 6
+    near, far = (
+        bootstrap_interval(values + np.array([0.0, shift] * 6), names, kinds, np.random.default_rng(0))
+        for shift in (0.0, 1000.0)
+    )
+    assert (far.low - 500, far.high - 500) == pytest.approx((near.low, near.high))
+    # A column of a band is a sample of its own.
+    columns = rng.normal(size=(12, 3))
+    for band in (lambda v: mean_band(v, names, kinds), lambda v: proportion_band(v > 0, names)):
+        np.testing.assert_allclose(band(columns)[:, 1:2], band(columns[:, 1:2]))
+
+
+def test_intervals_repeat_and_ask_for_three_buildings():
     values = np.arange(10.0)
     names = [str(i // 2) for i in range(10)]
     one, two = (bootstrap_interval(values, names, [""] * 10, np.random.default_rng(7)) for _ in range(2))
     assert one == two
-    alone = bootstrap_interval(values, ["a"] * 10, [""] * 10, np.random.default_rng(7))
-    assert alone.estimate == 4.5
-    assert np.isnan(alone.low)
-    assert np.isnan(alone.high)
+    for few in (["a"] * 10, ["a", "b"] * 5):
+        interval = bootstrap_interval(values, few, [""] * 10, np.random.default_rng(7))
+        assert interval.estimate == 4.5
+        assert np.isnan([interval.low, interval.high]).all()
+        assert np.isnan(proportion_interval(values > 4, few).low)
+        assert np.isnan(mean_band(values[:, None], few, few)[1:]).all()
     nothing = bootstrap_interval(np.array([]), [], [], np.random.default_rng(7))
     assert np.isnan(nothing.estimate)
+    assert np.isnan(proportion_interval(np.array([]), []).estimate)
+    for value in (0.0, 1.0, 0.3):
+        alike = bootstrap_interval(np.full(5, value), list("abcde"), [""] * 5, np.random.default_rng(7))
+        assert (alike.low, alike.high) == pytest.approx((value, value))
 
 
 def test_intervals_hold_what_they_promise():
@@ -103,18 +161,26 @@ def test_intervals_hold_what_they_promise():
         for unit, names in (("buildings", buildings.astype(str)), ("runs", np.arange(120).astype(str))):
             interval = bootstrap_interval(values, list(names), [""] * 120, rng, resamples=500)
             hits[unit] += interval.low <= 3.0 <= interval.high
-    assert 0.90 <= hits["buildings"] / trials <= 0.98
+    assert 0.92 <= hits["buildings"] / trials <= 0.98
     assert hits["runs"] / trials < 0.80
 
 
 def test_probability_of_improvement_by_hand():
     better = probability_of_improvement(np.array([1.0, 2.0, 3.0, 4.0]), np.array([2.0, 2.0, 2.0, 5.0]))
     np.testing.assert_array_equal(better, [1.0, 0.5, 0.0, 1.0])
-    interval = bootstrap_interval(better, list("abcd"), [""] * 4, np.random.default_rng(0), resamples=20_000)
-    assert interval.estimate == 0.625
-    # All draws of 4 with replacement, one by one.
-    draws = np.array(np.meshgrid(*[better] * 4)).reshape(4, -1).mean(axis=0)
-    assert (interval.low, interval.high) == tuple(np.quantile(draws, [0.025, 0.975]))
+    for values, names in ((better, list("abcd")), (np.tile(better, 5), [str(i // 2) for i in range(20)])):
+        interval = proportion_interval(values, names)
+        assert interval.estimate == 0.625
+        # The shares that a score test of the variance found does not reject.
+        sums = [sum(v - 0.625 for v, name in zip(values, names, strict=True) if name == n) for n in set(names)]
+        variance = len(sums) / (len(sums) - 1) * sum(s**2 for s in sums) / len(values) ** 2
+        for bound in (interval.low, interval.high):
+            error = np.sqrt(bound * (1 - bound) * variance / (0.625 * 0.375))
+            assert abs(bound - 0.625) == pytest.approx(scipy.stats.norm.ppf(0.975) * error)
+    # Where all agree, it is Wilson's interval of so many buildings.
+    wilson = scipy.stats.binomtest(6, 6).proportion_ci(method="wilson")
+    sure = proportion_interval(np.ones(12), [str(i // 2) for i in range(12)])
+    assert (sure.low, sure.high) == pytest.approx((wilson.low, wilson.high))
 
 
 def test_signed_rank_is_that_of_the_buildings():

@@ -149,7 +149,7 @@ def test_a_reference_that_completed_nothing():
     assert summary.against_reference == []
     assert {row.policy: row.complete for row in summary.rows} == {"b": 3, "nearest": 0}
     summary_text(summary)
-    coverage_figure(records, np.random.default_rng(0))
+    coverage_figure(records)
     ratio_figure(summary)
 
 
@@ -196,7 +196,7 @@ def test_the_summary_repeats(records):
 def test_figures_show_all_policies(records, tmp_path):
     import matplotlib.image
 
-    figure = coverage_figure(records, np.random.default_rng(0))
+    figure = coverage_figure(records)
     panel = figure.axes[0]
     lines = {line.get_label(): line for line in panel.get_lines()}
     assert set(lines) == {"nearest", "random", "largest", "fussy"}
