@@ -75,18 +75,10 @@ def extract_lines(
     """
     sensor = SensorConfig() if sensor is None else sensor
     config = MappingConfig() if config is None else config
-    angles = np.ascontiguousarray(angles, np.float64)
-    ranges = np.ascontiguousarray(ranges, np.float64)
-    if angles.ndim != 1 or ranges.ndim != 1:
-        raise ValueError(f"angles and ranges must be one-dimensional, got shapes {angles.shape} and {ranges.shape}")
-    if angles.size != ranges.size:
-        raise ValueError(f"angles and ranges differ in length: {angles.size} and {ranges.size}")
-    problem, beam = _check(angles, ranges)
-    if problem:
-        raise ValueError(_PROBLEMS[problem].format(beam=beam, angle=angles[beam], range=ranges[beam]))
+    angles, ranges = check_scan(angles, ranges)
     sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE)
     sigma_angle = max(sensor.sigma_angle, LEAST_ANGLE_NOISE)
-    start, points = _returns(angles, ranges, sensor.max_range, sensor.full_circle)
+    start, points = turned_returns(angles, ranges, sensor.max_range, sensor.full_circle)
     resolution = (angles[-1] - angles[0]) / (angles.size - 1) if angles.size > 1 else sensor.resolution
     x, y, beam_of, reach_of, cos_t, sin_t = points
     noise = sigma_range**2, sigma_angle**2
@@ -103,6 +95,20 @@ def extract_lines(
             sigma_range, sigma_angle, config.door_width, config.min_points, config.min_length, config.grouping,
         )
     )  # fmt: skip
+
+
+def check_scan(angles: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and ranges as contiguous float64 arrays; ValueError for what is no scan (see `extract_lines`)."""
+    angles = np.ascontiguousarray(angles, np.float64)
+    ranges = np.ascontiguousarray(ranges, np.float64)
+    if angles.ndim != 1 or ranges.ndim != 1:
+        raise ValueError(f"angles and ranges must be one-dimensional, got shapes {angles.shape} and {ranges.shape}")
+    if angles.size != ranges.size:
+        raise ValueError(f"angles and ranges differ in length: {angles.size} and {ranges.size}")
+    problem, beam = _check(angles, ranges)
+    if problem:
+        raise ValueError(_PROBLEMS[problem].format(beam=beam, angle=angles[beam], range=ranges[beam]))
+    return angles, ranges
 
 
 _PROBLEMS = {
@@ -129,7 +135,7 @@ def _check(angles: np.ndarray, ranges: np.ndarray) -> tuple[int, int]:
 
 
 @njit(cache=True)
-def _returns(
+def turned_returns(
     angles: np.ndarray, ranges: np.ndarray, max_range: float, full_circle: bool
 ) -> tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
     """First beam of a turned scan, and x, y, beam of its returns, and ranges, cos, sin of its beams.
