@@ -303,6 +303,21 @@ def rechain(pieces, kinds, visits, done, owner, dirty, local, kept, origin, fres
 
 
 @njit(cache=True)
+def unchanged(data, ends, gone, old_middle, old_ends):
+    """For each new chain (see `summarise`) the row in `gone` of one that was the very same, or -1."""
+    out = np.full(data.shape[0], -1, np.int64)
+    for q in range(data.shape[0]):
+        for row in gone:
+            off = abs(data[q, 1] - old_middle[row, 0]) + abs(data[q, 2] - old_middle[row, 1])
+            for k in range(4):
+                off += abs(ends[q, k] - old_ends[row, k])
+            if off < 1e-6:
+                out[q] = row
+                break
+    return out
+
+
+@njit(cache=True)
 def looked_at(pieces, apex, heading, points, angles, full, nudge):
     """Whether the known side of each piece (m, 4) lies in a scan polygon: the scan saw the edge from there."""
     out = np.zeros(pieces.shape[0], np.bool_)

@@ -20,6 +20,8 @@ _MAX_EDGE = 10.0
 """Longest edges of the graph, to leaves and between corners, m."""
 _TRAIL_EDGE = 0.6
 """Longest edge (m) from the way driven to anything else."""
+_ANCHOR = 3.0
+"""Greatest distance (m, in x and in y) of a place on the way driven from the corner that stands for it."""
 _BREATH = 0.002
 """A wall refitted nearer by this much (m) does not cut an edge: it would flicker."""
 
@@ -311,6 +313,49 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             )  # fmt: skip
             count += 1
     return pairs[:count].copy(), length[:count].copy(), wants[:count].copy(), free[:count].copy()
+
+
+@njit(cache=True)
+def components(links, kind, n_vertices):
+    """Number (v,) of the connected part that each corner belongs to, paths through leaves aside; -1 for the others."""
+    label = np.full(n_vertices, -1, np.int64)
+    stack = np.empty(n_vertices, np.int64)
+    parts = 0
+    for root in range(n_vertices):
+        if kind[root] != CORNER or label[root] >= 0:
+            continue
+        label[root] = parts
+        stack[0] = root
+        size = 1
+        while size > 0:
+            size -= 1
+            v = stack[size]
+            for h in range(links.first[v], links.first[v] + links.degree[v]):
+                w = links.target[h]
+                if kind[w] == CORNER and label[w] < 0:
+                    label[w] = parts
+                    stack[size] = w
+                    size += 1
+        parts += 1
+    return label
+
+
+@njit(cache=True)
+def anchors(points, position, kind, n_vertices, walls, w_start, w_items, pieces, p_start, p_items, owner, need):
+    """A corner (k,) that the disc can go to straight from each of the points (k, 2), or -1."""
+    out = np.full(points.shape[0], -1, np.int64)
+    for i in range(points.shape[0]):
+        x = points[i, 0]
+        y = points[i, 1]
+        for v in range(n_vertices):
+            if kind[v] != CORNER or abs(position[v, 0] - x) > _ANCHOR or abs(position[v, 1] - y) > _ANCHOR:
+                continue
+            if sweep_free(x, y, position[v, 0], position[v, 1], walls, w_start, w_items, need) and crossing_free(
+                x, y, position[v, 0], position[v, 1], pieces, p_start, p_items, owner, -2, -2, 0.0, 0.0
+            ):
+                out[i] = v
+                break
+    return out
 
 
 @njit(cache=True)

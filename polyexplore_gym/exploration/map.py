@@ -250,16 +250,24 @@ class ExplorationMap:
         alive = np.zeros(self._next_id + len(ids) + 1, np.bool_)
         self._next_id += len(ids)
         alive[self.owner] = True  # the last one stands for pieces without a chain
-        staying = alive[self.chains.id]
-        self._drop_vertices(self.chains.vertex[~staying])
+        c = self.chains
+        staying = alive[c.id]
         long_enough = np.flatnonzero(data[:, 0] >= self.min_gap)
-        m = len(long_enough)
+        gone = np.flatnonzero(~staying)
+        again = jump_edges.unchanged(data[long_enough], ends[long_enough], gone, c.middle, c.ends)
+        for q, row in zip(long_enough, again, strict=True):
+            if row >= 0:
+                self.owner[self.owner == ids[q]] = c.id[row]
+                c.visits[row], c.kind[row] = visits[q], kind[q]
+                staying[row] = True
+        self._drop_vertices(c.vertex[~staying])
+        new = long_enough[again < 0]
+        m = len(new)
         added = Chains(
-            ids[long_enough], data[long_enough, 0], data[long_enough, 1:3], data[long_enough, 3:5],
-            ends[long_enough], kind[long_enough], visits[long_enough], np.zeros((m, 3)),
-            np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
+            ids[new], data[new, 0], data[new, 1:3], data[new, 3:5], ends[new], kind[new], visits[new],
+            np.zeros((m, 3)), np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
         )  # fmt: skip
-        self.chains = self.chains.take(np.flatnonzero(staying)).join(added)
+        self.chains = c.take(np.flatnonzero(staying)).join(added)
 
     def _drop_vertices(self, vertices: np.ndarray) -> None:
         vertices = vertices[vertices >= 0]
@@ -300,7 +308,6 @@ class ExplorationMap:
             self._trail.append(came)
         if len(c) and not np.isfinite(c.path_length).any() and self._trail:
             g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
-            self._trail = []
             self._update_paths()
             local[:] = True
         self._place_within(np.flatnonzero(local & ~np.isfinite(c.path_length)))

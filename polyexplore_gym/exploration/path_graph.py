@@ -24,7 +24,18 @@ from polyexplore_gym.exploration.corners import (
     distinct,
     retire,
 )
-from polyexplore_gym.exploration.links import Links, connect, insert, isolate, reachable, repack, sever, unblocked
+from polyexplore_gym.exploration.links import (
+    Links,
+    anchors,
+    components,
+    connect,
+    insert,
+    isolate,
+    reachable,
+    repack,
+    sever,
+    unblocked,
+)
 from polyexplore_gym.exploration.segments import (
     bucket,
     build_grid,
@@ -257,16 +268,29 @@ class PathGraph:
         self.row_of[vertices] = -1
 
     def add_trail(self, points: np.ndarray, robot: int) -> None:
-        """Make the way driven (k, 2) part of the graph, up to the robot: it led here, so it leads back."""
-        ids = self._new_vertices(points, np.tile([1e9, 0.0, 1.0, 0.0, 1.0, 0.0, TRAIL], (len(points), 1)))
-        chain = np.append(ids, robot)
-        pairs = np.stack((chain[:-1], chain[1:]), axis=1)
+        """Make the way driven (k, 2) part of the graph, up to the robot: it led here, so it leads back.
+
+        Only the points that no corner can stand for are laid, and those between two parts of the graph.
+        """
+        anchor = anchors(
+            points, self.position, self.kind, self.n_vertices, self.walls, *self.wall_grid, self.pieces,
+            *self.piece_grid, self.piece_owner, self.sweep,
+        )  # fmt: skip
+        part = np.where(anchor < 0, -1, components(self.links, self.kind, self.n_vertices)[anchor])
+        changes = part[:-1] != part[1:]
+        laid = np.flatnonzero((part < 0) | np.append(changes, True) | np.append(True, changes))
+        ids = self._new_vertices(points[laid], np.tile([1e9, 0.0, 1.0, 0.0, 1.0, 0.0, TRAIL], (len(laid), 1)))
         self.connect()
-        linked = [v in self.neighbours(u) for u, v in pairs]
-        pairs = pairs[~np.array(linked)]
-        self._insert(
-            pairs, np.hypot(*(self.position[pairs[:, 0]] - self.position[pairs[:, 1]]).T), np.zeros(len(pairs))
-        )
+        neighbours = np.flatnonzero(np.diff(laid) == 1)
+        held = np.flatnonzero(anchor[laid] >= 0)
+        pairs = np.concatenate((
+            np.stack((ids[neighbours], ids[neighbours + 1]), axis=1),
+            np.stack((ids[held], anchor[laid[held]]), axis=1),
+            [[ids[-1], robot]],
+        ))  # fmt: skip
+        pairs = pairs[[v not in self.neighbours(u) for u, v in pairs]]
+        length = np.hypot(*(self.position[pairs[:, 0]] - self.position[pairs[:, 1]]).T)
+        self._insert(pairs, length, np.zeros(len(pairs)))
 
     def neighbours(self, v: int) -> np.ndarray:
         """The vertices (k,) that open edges join to v."""
