@@ -5,6 +5,7 @@ from polyexplore_gym.mapping.extract import ScanLines, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
 from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
 from polyexplore_gym.mapping.logs import LaserLog, read_log
+from polyexplore_gym.mapping.polylines import ScanPolylines, extract_polylines
 
 __all__ = [
     "MAP_SUFFIXES",
@@ -12,7 +13,9 @@ __all__ = [
     "LineMap",
     "LogMap",
     "ScanLines",
+    "ScanPolylines",
     "extract_lines",
+    "extract_polylines",
     "map_log",
     "read_log",
     "save_map",
