@@ -9,6 +9,15 @@ from numba import njit
 
 OBLIQUE = 1.0 / math.cos(math.radians(70.0))  # neighbouring leftover returns are joined up to this incidence
 COARSEST = 0.2  # largest simplification tolerance, m
+LEAST = 0.01  # least length of a piece, m
+
+
+@njit(cache=True)
+def lone(x: float, y: float, resolution: float, out: np.ndarray, count: int) -> int:
+    """Append a piece about the return (x, y), across its beam and as wide, to out. Returns the new count."""
+    half = 0.5 * max(resolution, LEAST / math.hypot(x, y))
+    out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x + half * y, y - half * x, x - half * y, y + half * x
+    return count + 1
 
 
 @njit(cache=True)
@@ -32,6 +41,8 @@ def simplify(
         if best >= 0:
             stack.append((best, b))
             stack.append((a, best))
+        elif length < LEAST:  # very near the robot
+            count = lone(x[a], y[a], 0.0, out, count)
         else:
             out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x[a], y[a], x[b], y[b]
             count += 1
@@ -65,11 +76,7 @@ def fragment_chains(
                 break
             stop += 1
         if stop == k:
-            d = math.hypot(x[k], y[k])
-            half = 0.5 * max(resolution, 0.01 / d)
-            out[count, 0], out[count, 1] = x[k] + half * y[k], y[k] - half * x[k]
-            out[count, 2], out[count, 3] = x[k] - half * y[k], y[k] + half * x[k]
-            count += 1
+            count = lone(x[k], y[k], resolution, out, count)
         else:
             count = simplify(x, y, k, stop, var_range, var_angle, out, count)
         k = stop + 1

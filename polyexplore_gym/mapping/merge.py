@@ -26,6 +26,7 @@ MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
 STANDS_FOR = 0.5  # rad; a segment facing farther away does not stand for another: short walls at corners stay
 COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
+LEAST_PIECE = 0.01  # m; shorter pieces on a line are widened to this
 LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end along its line
 
 
@@ -186,8 +187,11 @@ def lay(
                     best = q
             if best >= 0:
                 met = True
+                least, most = min(low, span[best, 0]), max(high, span[best, 1])
                 low, v_low = fused_end(span[best, 0], span[best, 2], low, v_low, -1.0)
                 high, v_high = fused_end(span[best, 1], span[best, 3], high, v_high, 1.0)
+                if high <= low:  # apart, and their ends known so differently that the means cross
+                    low, high = least, most
                 if span[best, 4] >= 0:
                     if keep < 0:
                         keep = int(span[best, 4])
@@ -210,9 +214,12 @@ def lay(
         rows.side[row] = lines.side[line]
         rows.next[row] = lines.first[line]
         lines.first[line] = row
+        low, high = span[q, 0], span[q, 1]
+        if high - low < LEAST_PIECE:
+            low, high = 0.5 * (low + high - LEAST_PIECE), 0.5 * (low + high + LEAST_PIECE)
         e = rows.ends[row]
-        e[0], e[1] = rho * ca - span[q, 0] * sa, rho * sa + span[q, 0] * ca
-        e[2], e[3] = rho * ca - span[q, 1] * sa, rho * sa + span[q, 1] * ca
+        e[0], e[1] = rho * ca - low * sa, rho * sa + low * ca
+        e[2], e[3] = rho * ca - high * sa, rho * sa + high * ca
         rows.end_variance[row, 0], rows.end_variance[row, 1] = span[q, 2], span[q, 3]
         rows.sigma[row] = across(alpha, p, e)
         publish(rows, grid, slots, row)
@@ -252,8 +259,9 @@ def covered(
     s: np.ndarray, sigma: float, side_alpha: float, any_side: bool, rows: Rows, lines: Lines, grid: Grid, stamp: int,
     sigma_range: float, found: np.ndarray,
 ) -> tuple[float, float]:  # fmt: skip
-    """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a > b if none.
+    """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a >= b if none.
 
+    It is looked at every 5 cm or less; a part seen at one place only reaches half way to the next.
     Rows touched first in insert `stamp` that are fragments do not count: they come from the same scan.
     With any_side False only rows that face the same way (normal direction side_alpha) count.
     """
@@ -282,6 +290,8 @@ def covered(
                 break
         if not hit:
             first, last = min(first, t), max(last, t)
+    if first == last:
+        first, last = max(first - 0.5 / steps, 0.0), min(last + 0.5 / steps, 1.0)
     return first, last
 
 
@@ -399,7 +409,7 @@ def insert(
                 # a wall known already, but not within the gate: only what is new of it
                 sigma = across(a0, p0, placed[k])
                 a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, sigma_range, found)
-                if a > b:
+                if a >= b:
                     continue
                 clip(fresh[m], a, b)
             m += 1
@@ -423,7 +433,7 @@ def insert(
             d2 = max(d2, x * x + y * y)
         sigma = math.sqrt(var_range + var_xy + (var_angle + pose_covariance[2, 2]) * d2)
         a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, sigma_range, found)
-        if a > b:
+        if a >= b:
             continue
         row = new_row(rows, slots)
         rows.line[row], rows.side[row], rows.next[row], rows.sigma[row] = -1, 0, -1, sigma

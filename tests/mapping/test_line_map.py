@@ -1,5 +1,6 @@
 """LineMap: merging across scans, sides, doorways, slots, touched rows; the index against brute force."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -165,6 +166,51 @@ def test_walls_of_random_rooms_are_covered():
         rest.extend(share[length > 0.45])
     assert np.mean(short) > 0.55
     assert np.mean(rest) > 0.98
+
+
+@pytest.mark.parametrize("sigma", [None, 2 * POSE_SIGMA])
+@pytest.mark.parametrize("sensor", [SENSOR, FIVE])
+def test_no_segment_shrinks_to_a_point(sensor, sigma):
+    shortest = math.inf
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        walls = np.vstack([ragged(rng), jagged_room(rng, size=3.0), box(0.4, 1.0, 0.43, 1.02)])
+        line_map = LineMap(sensor=sensor)
+        for _ in range(60):
+            look(line_map, walls, [*rng.uniform(-2.4, 2.4, 2), rng.uniform(-math.pi, math.pi)], rng, sigma)
+            rows = line_map.segments[line_map.alive]
+            shortest = min(shortest, np.hypot(*(rows[:, 2:] - rows[:, :2]).T).min())
+    assert shortest > 1e-3
+
+
+def one_line(segments):
+    """A scan of one line, x = 2, with these pieces from y1 to y2, and no points."""
+    segments = np.array([[2.0, a, 2.0, b] for a, b in segments])
+    return ScanLines(
+        np.array([2.0]), np.zeros(1), np.diag([1e-4, 1e-6])[None], segments, np.zeros(len(segments), int),
+        np.zeros(0, int), np.zeros((0, 4)), np.zeros(0),
+    )  # fmt: skip
+
+
+def test_pieces_whose_ends_cross_when_fused_are_joined_whole():
+    """Short pieces a small gap apart, the ends of each known differently: the means would swap the ends."""
+    line_map = LineMap(sensor=FIVE)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        line_map.insert(one_line(np.sort(rng.uniform(-0.2, 0.2, (1, 2)))), np.zeros(3), np.diag([1e-3, 1e-3, 1e-4]))
+        x1, y1, x2, y2 = line_map.segments[line_map.alive].T
+        assert (y2 - y1 > 5e-3).all()
+
+
+def test_what_is_new_at_one_place_only_stays_as_a_fragment():
+    """A lone return beyond the end of a wall: one of its two ends is not covered."""
+    line_map = LineMap(sensor=SENSOR)
+    line_map.insert(one_line([(-1.0, 1.0)]), np.zeros(3), EXACT)
+    nothing = extract_lines(HALF, np.full(361, np.inf))
+    fragment = np.array([[2.0, 1.05, 2.0, 1.09]])
+    touched = line_map.insert(dataclasses.replace(nothing, fragments=fragment), np.zeros(3), EXACT)
+    np.testing.assert_array_equal(touched, [1])
+    np.testing.assert_allclose(line_map.segments[1], [2.0, 1.07, 2.0, 1.09])
 
 
 def test_a_line_behind_the_origin_is_stored_with_positive_rho():
