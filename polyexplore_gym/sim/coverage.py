@@ -34,7 +34,7 @@ def _bin(y, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _visible(segments, x, y, dx, dy, reach):  # type: ignore[no-untyped-def]
+def visible(segments, x, y, dx, dy, reach):  # type: ignore[no-untyped-def]
     """Which of the points at (dx, dy) (n,) from the sensor at x, y no wall hides: (n,) bool.
 
     All points lie within reach."""
@@ -141,10 +141,10 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
                 if d2 <= reach * reach and ux * hx + uy * hy >= least * math.sqrt(d2):
                     slots[n], dx[n], dy[n] = j, ux, uy
                     n += 1
-    visible = _visible(segments, x, y, dx[:n], dy[:n], reach)
+    shown = visible(segments, x, y, dx[:n], dy[:n], reach)
     new = 0
     for i in range(n - 1, -1, -1):  # from the back, so that a swap moves no slot still to come
-        if not visible[i]:
+        if not shown[i]:
             continue
         j = slots[i]
         cell = int((py[j] - y0) / _CELL) * columns + int((px[j] - x0) / _CELL)
