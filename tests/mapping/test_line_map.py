@@ -196,11 +196,11 @@ def test_pieces_whose_ends_cross_when_fused_are_joined_whole():
     """Short pieces a small gap apart, the ends of each known differently: the means would swap the ends."""
     line_map = LineMap(sensor=FIVE)
     pose, covariance = np.zeros(3), np.diag([1e-3, 1e-3, 1e-5])
-    line_map.insert(one_line([(0.0, 0.05)]), pose, covariance)
+    line_map.insert(one_line([(0.0, 0.02)]), pose, covariance)
     line_map._rows.end_variance[0] = 1e-2, 1e-5
-    line_map.insert(one_line([(0.2, 0.25)]), pose, covariance)
+    line_map.insert(one_line([(0.1, 0.12)]), pose, covariance)
     assert line_map.alive.sum() == 1
-    np.testing.assert_allclose(line_map.segments[0, [1, 3]], [0.0, 0.25], atol=1e-9)
+    np.testing.assert_allclose(line_map.segments[0, [1, 3]], [0.0, 0.12], atol=1e-9)
 
 
 def test_what_is_new_at_one_place_only_stays_as_a_fragment():
