@@ -2,7 +2,11 @@
 
 Lines of one scan are grouped in the scan's own frame, where they do not share a pose error. A line
 may carry several segments: it is cut at doorways, found by predicting the next return on it
-(Iles, Seder, Petrovic; the distances l1 and l2 there).
+(Iles, Seder, Petrovic). Of the two distances predicted there only the largest, l1, is used. The
+smallest, l2, is meant for returns in front of the line that belong to something else. As a gate on
+their range (5 sigma) it is wider than the gate of 3 sigma normal to the line, which they passed
+already: of 208,000 returns on the lines of 600 office scans it rejects none. As a least distance
+from the return before it would reject 85 % of true neighbours (0.01 m, 0.1 degrees) and more.
 """
 
 from __future__ import annotations
