@@ -61,6 +61,32 @@ def _covered(ax, ay, bx, by, wall, margin):
 
 
 @njit(cache=True)
+def _take_off(ax, ay, bx, by, walls, margin, same_way, kept, n_kept, cut):
+    """Take off the intervals `kept` of a-b what walls along it cover; `same_way`: only those that run as a-b does."""
+    x0 = min(ax, bx) - margin
+    x1 = max(ax, bx) + margin
+    y0 = min(ay, by) - margin
+    y1 = max(ay, by) + margin
+    for w in range(walls.shape[0]):
+        if (
+            max(walls[w, 0], walls[w, 2]) < x0
+            or min(walls[w, 0], walls[w, 2]) > x1
+            or max(walls[w, 1], walls[w, 3]) < y0
+            or min(walls[w, 1], walls[w, 3]) > y1
+            or (same_way and (walls[w, 2] - walls[w, 0]) * (bx - ax) + (walls[w, 3] - walls[w, 1]) * (by - ay) <= 0.0)
+        ):
+            continue
+        lo, hi = _covered(ax, ay, bx, by, walls[w], margin)
+        if hi > lo:
+            cut[0, 0] = lo
+            cut[0, 1] = hi
+            n_kept = subtract(kept, n_kept, cut, 1)
+            if n_kept == 0:
+                break
+    return n_kept
+
+
+@njit(cache=True)
 def clip(pieces, apexes, headings, points, rays, first, last, angles, full, reach, nudge, walls, margin, shortest):
     """Clip pieces (m, 4) by scan polygons `first` to `last` and by walls along them.
 
@@ -111,25 +137,7 @@ def clip(pieces, apexes, headings, points, rays, first, last, angles, full, reac
             if n_kept == 0:
                 break
         if n_kept > 0:
-            x0 = min(ax, bx) - margin
-            x1 = max(ax, bx) + margin
-            y0 = min(ay, by) - margin
-            y1 = max(ay, by) + margin
-            for w in range(walls.shape[0]):
-                if (
-                    max(walls[w, 0], walls[w, 2]) < x0
-                    or min(walls[w, 0], walls[w, 2]) > x1
-                    or max(walls[w, 1], walls[w, 3]) < y0
-                    or min(walls[w, 1], walls[w, 3]) > y1
-                ):
-                    continue
-                lo, hi = _covered(ax, ay, bx, by, walls[w], margin)
-                if hi > lo:
-                    cut[0, 0] = lo
-                    cut[0, 1] = hi
-                    n_kept = subtract(kept, n_kept, cut, 1)
-                    if n_kept == 0:
-                        break
+            n_kept = _take_off(ax, ay, bx, by, walls, margin, False, kept, n_kept, cut)
         if n_kept != 1 or kept[0, 0] > 1e-9 or kept[0, 1] < 1.0 - 1e-9:
             changed[i] = True
         for r in range(n_kept):
@@ -168,23 +176,7 @@ def clip_known(pieces, known, margin, shortest):
         size = math.hypot(bx - ax, by - ay)
         kept[0, 0] = 0.0
         kept[0, 1] = 1.0
-        n_kept = 1
-        for w in range(known.shape[0]):
-            if (
-                max(known[w, 0], known[w, 2]) < min(ax, bx) - margin
-                or min(known[w, 0], known[w, 2]) > max(ax, bx) + margin
-                or max(known[w, 1], known[w, 3]) < min(ay, by) - margin
-                or min(known[w, 1], known[w, 3]) > max(ay, by) + margin
-                or (known[w, 2] - known[w, 0]) * (bx - ax) + (known[w, 3] - known[w, 1]) * (by - ay) <= 0.0
-            ):
-                continue
-            lo, hi = _covered(ax, ay, bx, by, known[w], margin)
-            if hi > lo:
-                cut[0, 0] = lo
-                cut[0, 1] = hi
-                n_kept = subtract(kept, n_kept, cut, 1)
-                if n_kept == 0:
-                    break
+        n_kept = _take_off(ax, ay, bx, by, known, margin, True, kept, 1, cut)
         for r in range(n_kept):
             whole = kept[r, 1] - kept[r, 0] == 1.0
             if (whole or (kept[r, 1] - kept[r, 0]) * size >= shortest) and count < out.shape[0]:

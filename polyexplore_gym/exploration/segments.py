@@ -130,25 +130,35 @@ def clearances(points, segments, start, items, limit):
     return out
 
 
-@njit(cache=True)
-def sweep_free(ax, ay, bx, by, segments, start, items, radius):
-    """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
-    mask = start.size - 2
-    ix = math.floor(ax / CELL)
-    iy = math.floor(ay / CELL)
-    jx = math.floor(bx / CELL)
-    jy = math.floor(by / CELL)
+@njit(cache=True, inline="always")
+def walk(ax, ay, bx, by):
+    """How a-b runs through the grid: its first cell, the steps in x and y, the parameters along it of the next
+    borders in x and y and what they grow by, and the number of cells (Amanatides and Woo 1987)."""
     dx = bx - ax
     dy = by - ay
+    ix = math.floor(ax / CELL)
+    iy = math.floor(ay / CELL)
+    cells = abs(math.floor(bx / CELL) - ix) + abs(math.floor(by / CELL) - iy) + 1
     sx = 1 if dx > 0 else -1
     sy = 1 if dy > 0 else -1
     tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
     ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
-    steps = abs(jx - ix) + abs(jy - iy)
+    wx = CELL / abs(dx) if dx != 0.0 else math.inf
+    wy = CELL / abs(dy) if dy != 0.0 else math.inf
+    return ix, iy, sx, sy, tx, ty, wx, wy, cells
+
+
+@njit(cache=True)
+def sweep_free(ax, ay, bx, by, segments, start, items, radius):
+    """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
+    mask = start.size - 2
+    dx = bx - ax
+    dy = by - ay
     length = math.hypot(dx, dy)
     ux = dx / length if length > 0.0 else 1.0
     uy = dy / length if length > 0.0 else 0.0
-    for _ in range(steps + 1):
+    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by)
+    for _ in range(cells):
         b = bucket(ix, iy, mask)
         for e in range(start[b], start[b + 1]):
             i = items[e]
@@ -169,10 +179,10 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
                 return False
         if tx < ty:
             ix += sx
-            tx += CELL / abs(dx)
+            tx += wx
         else:
             iy += sy
-            ty += CELL / abs(dy) if dy != 0.0 else math.inf
+            ty += wy
     return True
 
 
@@ -180,19 +190,11 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
 def crossing_free(ax, ay, bx, by, segments, start, items, owner, own_a, own_b, slack_a, slack_b):
     """Whether a-b crosses no segment, but within `slack_a` m of a, `slack_b` m of b, or those of its owners."""
     mask = start.size - 2
-    ix = math.floor(ax / CELL)
-    iy = math.floor(ay / CELL)
-    jx = math.floor(bx / CELL)
-    jy = math.floor(by / CELL)
     dx = bx - ax
     dy = by - ay
     length = math.hypot(dx, dy)
-    sx = 1 if dx > 0 else -1
-    sy = 1 if dy > 0 else -1
-    tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
-    ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
-    steps = abs(jx - ix) + abs(jy - iy)
-    for _ in range(steps + 1):
+    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by)
+    for _ in range(cells):
         b = bucket(ix, iy, mask)
         for e in range(start[b], start[b + 1]):
             i = items[e]
@@ -203,8 +205,8 @@ def crossing_free(ax, ay, bx, by, segments, start, items, owner, own_a, own_b, s
                 return False
         if tx < ty:
             ix += sx
-            tx += CELL / abs(dx)
+            tx += wx
         else:
             iy += sy
-            ty += CELL / abs(dy) if dy != 0.0 else math.inf
+            ty += wy
     return True
