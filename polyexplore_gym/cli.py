@@ -64,6 +64,10 @@ class Bench:
     """Starts (and streams of noise) on each plan."""
     workers: int = 0
     """Processes; 0: one a core."""
+    backend: Literal["loky", "ray"] = "loky"
+    """Where episodes run: in processes of this machine, or on a Ray cluster."""
+    address: str | None = None
+    """Address of a running Ray cluster (auto, or host:port), all cores of which are used; else one is started here."""
     out: Path = Path("results/bench")
     """Folder of the results."""
     drive: Drive | None = None
@@ -170,7 +174,13 @@ def bench(options: Bench) -> int:
     _say(f"{len(study.plans)} plans x {len(study.seeds)} starts x {len(study.placements)} placements x "
          f"{len(study.policies)} policies = {total} episodes -> {options.out}")  # fmt: skip
     try:
-        records = evaluate(study, out=options.out, workers=options.workers or os.cpu_count() or 1)
+        records = evaluate(
+            study,
+            out=options.out,
+            workers=options.workers or os.cpu_count() or 1,
+            backend=options.backend,
+            address=options.address,
+        )
     except KeyboardInterrupt:
         _say(f"\nstopped; the results so far are in {options.out}: the same command goes on from there")
         return 130

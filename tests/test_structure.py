@@ -38,7 +38,7 @@ ALLOWED = {
         "snapshot",
     },
 }  # fmt: skip
-HEAVY = {"matplotlib", "pygame", "torch", "cv2", "stable_baselines3", "sb3_contrib", "imageio", "PIL"}
+HEAVY = {"matplotlib", "pygame", "torch", "cv2", "stable_baselines3", "sb3_contrib", "imageio", "PIL", "ray", "jinja2"}
 SCRIPTED = ("choice", "distance_advantage", "ekman_ratio", "largest", "modified_sum", "nearest", "uniform", "utility")
 GENERATORS = {"default_rng", "Generator", "SeedSequence", "BitGenerator", "PCG64"}
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import gymnasium
 
@@ -27,6 +27,8 @@ FORMAT = 1
 """Raised when the files' layout changes."""
 
 MakeEnv = Callable[[EnvConfig], gymnasium.Env]
+Backend = Literal["loky", "ray"]
+"""Where episodes run: in processes of this machine, or on a Ray cluster."""
 
 
 def make_env(config: EnvConfig) -> gymnasium.Env:
@@ -132,6 +134,8 @@ def evaluate(
     *,
     out: Path | str | None = None,
     workers: int = 1,
+    backend: Backend = "loky",
+    address: str | None = None,
     progress: bool = True,
     make_env: MakeEnv = make_env,
 ) -> list[EpisodeRecord]:
@@ -144,16 +148,22 @@ def evaluate(
     Args:
         study: what to run.
         out: folder of the results; None: keep them in memory only.
-        workers: processes; 1 runs in this one. The records do not depend on it.
+        workers: processes; the records do not depend on it.
+        backend: "loky", processes of this machine (1 runs in this one), or "ray".
+        address: Ray only: a running cluster ("auto", "host:port"), all cores of which are used; None starts
+            one of `workers` cores on this machine.
         progress: show a bar with the time left.
         make_env: makes the environment from its configuration; must be importable by the workers.
 
     Raises:
-        InvalidConfigError: a policy cannot be made.
-        ResultsError: `out` belongs to another study or is damaged, cannot be written, or a worker died.
+        InvalidConfigError: a policy cannot be made, or there is no cluster at the address.
+        ResultsError: `out` belongs to another study or is damaged, cannot be written, a worker died, or a
+            machine of the cluster has other versions.
     """
     if workers < 1:
         raise InvalidConfigError(f"workers = {workers}: must be at least 1")
+    if backend not in get_args(Backend):
+        raise InvalidConfigError(f"backend = {backend!r}: must be one of {', '.join(get_args(Backend))}")
     for spec in study.policies.values():
         load_policy(spec)  # a wrong name is an error now, not a failed record for every episode
     tasks = list(study.tasks())
@@ -170,7 +180,7 @@ def evaluate(
         missing = [task for task in tasks if task.key not in done]
         bar = stack.enter_context(_bar(len(tasks), len(tasks) - len(missing), progress))
         failed = 0
-        for record in _run(missing, workers, make_env):
+        for record in _run(missing, workers, make_env, backend, address):
             append(record)
             failed += record.status == "failed"
             if failed:
@@ -185,23 +195,37 @@ def _bar(total: int, done: int, progress: bool) -> Any:
     return tqdm(total=total, initial=done, unit="episode", disable=not progress, dynamic_ncols=True, smoothing=0.05)
 
 
-def _run(tasks: list[Task], workers: int, make_env: MakeEnv) -> Iterator[EpisodeRecord]:
+def _run(
+    tasks: list[Task], workers: int, make_env: MakeEnv, backend: Backend, address: str | None
+) -> Iterator[EpisodeRecord]:
     """Records in the order in which the episodes end."""
-    if workers == 1 or len(tasks) <= 1:
+    if backend == "ray" and tasks:
+        from polyexplore_gym.evaluation.cluster import RayBackend, cluster
+
+        with cluster(address, workers) as cores:
+            run = functools.partial(_run_task_elsewhere, ours=versions())
+            yield from _parallel(tasks, cores, make_env, RayBackend(), run)
+    elif workers == 1 or len(tasks) <= 1:
         yield from (_run_task(task, make_env) for task in tasks)
-        return
+    else:
+        yield from _parallel(tasks, workers, make_env, "loky", _run_task)
+
+
+def _parallel(
+    tasks: list[Task], workers: int, make_env: MakeEnv, backend: Any, run: Callable[..., EpisodeRecord]
+) -> Iterator[EpisodeRecord]:
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     # Two tasks ahead a worker: enough to keep all busy, and little is lost when the run is killed.
     parallel = Parallel(
         n_jobs=workers,
-        backend="loky",
+        backend=backend,
         return_as="generator_unordered",
         batch_size=1,
         pre_dispatch="2 * n_jobs",
     )
-    results = parallel(delayed(_run_task)(task, make_env) for task in tasks)
+    results = parallel(delayed(run)(task, make_env) for task in tasks)
     try:
         yield from results
     except TerminatedWorkerError as error:
@@ -213,6 +237,14 @@ def _run(tasks: list[Task], workers: int, make_env: MakeEnv) -> Iterator[Episode
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # joblib tells of the tasks that a stop leaves behind
             results.close()
+
+
+def _run_task_elsewhere(task: Task, make_env: MakeEnv, ours: dict[str, str]) -> EpisodeRecord:
+    theirs = _versions()
+    different = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if theirs[name] != ours[name]]
+    if different:
+        raise ResultsError(f"{platform.node()} has {'; '.join(different)}: its results would not be comparable")
+    return _run_task(task, make_env)
 
 
 def _run_task(task: Task, make_env: MakeEnv) -> EpisodeRecord:
@@ -272,3 +304,7 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "unknown"
     return found
+
+
+_versions = functools.cache(versions)
+"""Once in a worker."""
