@@ -145,6 +145,14 @@ class Gates:
         self._measure()
         return parent
 
+    def keep(self, witnesses: np.ndarray) -> np.ndarray:
+        """Keep the gates of these witnesses (sorted), which are renumbered; the old gate of each new one."""
+        parent = np.flatnonzero(np.isin(self.owner, witnesses))
+        self.owner = np.searchsorted(witnesses, self.owner[parent])
+        self.low, self.high = self.low[parent], self.high[parent]
+        self._measure()
+        return parent
+
     def place(self, gate: int) -> np.ndarray:
         """A point (2,) of a gate: its middle sample."""
         return np.asarray(self.samples[(self.low[gate] + self.high[gate]) // 2])
@@ -176,7 +184,7 @@ class Gates:
         edge = self.reach[self.low]
         starts = np.searchsorted(gate, np.arange(len(self.owner)))
         self.first = np.maximum(0.0, np.minimum.reduceat(self.first_of[order], starts) - edge)
-        self.between = np.maximum(0.0, between - edge[:, None] - edge)
+        self.between = np.maximum(0.0, between - (edge[:, None] + edge))
 
 
 def _sampled(line: np.ndarray) -> tuple[np.ndarray, float]:

@@ -47,12 +47,16 @@ _TABLE_STEP = 0.01
 """Effort of a step of the exact table, in units of that of the linear program."""
 _TABLE = 1e7
 """Largest effort of an exact table; beyond it the linear program bounds the tour."""
+_IDLE = 1e-3
+"""A witness that adds less than this (m) to an exact tour may make room for another."""
 _TURN = 1e6
 """Effort of everything else in a turn."""
 _ROUNDS = 60
 """Most rounds of cuts in a turn."""
-_SLOW = 1.01
+_SLOW = 1.02
 """When finer gates gain less than this factor it is time for more witnesses."""
+_STALE = 1.0003
+"""When there are none, and three turns in a row gain less than this factor, it is enough."""
 
 
 @dataclass(frozen=True)
@@ -111,10 +115,31 @@ class _Search:
         """Take checkpoints as witnesses; parent gates of the new set of gates."""
         old = len(self.gates.owner)
         reach = self.sight.max_range + _RANGE_TOLERANCE
-        borders = [windows(self.sight.walls, self.sight.points[c], reach, self.space.area) for c in checkpoints]
+        sight, area = self.sight, self.space.area
+        borders = [windows(sight.walls, sight.points[c], reach, area, self.start) for c in checkpoints]
         taken = self.gates.add(borders)
         self.witnesses += [c for c, ok in zip(checkpoints, taken, strict=True) if ok]
         return np.concatenate([np.arange(old), np.full(len(self.gates.owner) - old, -1)])
+
+    def drop(self, witnesses: list[int]) -> np.ndarray:
+        """Leave witnesses (rows) out; parent gates of the new set of gates."""
+        kept = np.setdiff1d(np.arange(len(self.witnesses)), witnesses)
+        self.witnesses = [self.witnesses[w] for w in kept]
+        return self.gates.keep(kept)
+
+    def idle(self, order: list[int]) -> list[int]:
+        """Witnesses whose gates an exact tour (gates in order) passes at no cost, never two in a row."""
+        gates, out, last = self.gates, [], -2
+        for k, g in enumerate(order):
+            before = gates.first if k == 0 else gates.between[order[k - 1]]
+            if k + 1 == len(order):
+                detour = before[g]
+            else:
+                detour = before[g] + gates.between[g, order[k + 1]] - before[order[k + 1]]
+            if detour < _IDLE and last != k - 1:
+                out.append(int(gates.owner[g]))
+                last = k
+        return out
 
     def seen(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Checkpoints seen on a shortest way from a to b."""
@@ -145,12 +170,13 @@ class _Search:
         if not self.witnesses:
             return LowerBound(0.0, np.zeros((0, 2)))
         cuts, columns = Cuts.none(len(gates.owner)), np.zeros((0, 2), np.int64)
-        best, before, spent = 0.0, 0.0, 0.0
+        best, before, spent, stale = 0.0, 0.0, 0.0, 0
         witnesses = list(self.witnesses)
         while True:
             steps = _TABLE_STEP * exact.work(len(gates.owner), len(self.witnesses))
             if steps < _TABLE:
                 length, order = exact.shortest_tour(gates.first, gates.between, gates.owner)
+                idle = self.idle(order)
                 taken = np.bincount(order, minlength=len(gates.owner)).astype(np.float64)
                 pairs, shares = np.stack([[-1, *order[:-1]], order], axis=1), np.ones(len(order))
                 spent += steps
@@ -171,9 +197,18 @@ class _Search:
                 route = np.vstack([self.start, *(gates.place(int(g)) for g in np.flatnonzero(taken > 0.3))])
                 score = np.where(missed > 0.05, missed * (0.1 + self.depth(route)), 0.0)
                 chosen = self.independent(score, max(3, len(self.witnesses) // 4))
+                fits = _fitting(len(gates.owner), len(self.witnesses))
+                if steps < _TABLE and len(chosen) > fits and idle:
+                    self.drop(idle)  # room for others; the exact table needs no cuts
+                    cuts, columns = Cuts.none(len(gates.owner)), columns[:0]
+                    coarse = coarse[:0]
+                    fits = _fitting(len(gates.owner), len(self.witnesses))
+                if steps < _TABLE and fits > 0:
+                    chosen = chosen[:fits]
+            stale = 0 if chosen or length > _STALE * before else stale + 1
             before = length
             spent += _TURN
-            if spent >= effort or not (len(coarse) or chosen):
+            if spent >= effort or stale == 3 or not (len(coarse) or chosen):
                 return LowerBound(max(0.0, best - _ROUNDING), sight.points[witnesses])
             if len(coarse):
                 parent = gates.split(coarse)
@@ -181,6 +216,14 @@ class _Search:
             if chosen:
                 parent = self.add(chosen)
                 cuts = cuts.regrouped(parent, gates.between)
+
+
+def _fitting(gates: int, witnesses: int) -> int:
+    """How many more witnesses, of ten gates each, an exact table has room for."""
+    more = 0
+    while _TABLE_STEP * exact.work(gates + 10 * (more + 1), witnesses + more + 1) < _TABLE:
+        more += 1
+    return more
 
 
 def _children(columns: np.ndarray, parent: np.ndarray) -> np.ndarray:

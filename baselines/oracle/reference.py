@@ -25,7 +25,7 @@ VERSION = 1
 """Raised whenever a reference would come out differently: kept ones are then computed anew."""
 ITERATIONS = 300
 """Rounds of destroy and repair of each tour."""
-EFFORT = 2e8
+EFFORT = 2.5e8
 """Work on the lower bound, about 1e7 a second."""
 _LARGE = 2500.0
 """Plans of more m2 have places 0.6 m apart instead of 0.3 m."""

@@ -164,13 +164,17 @@ def visibility_ring(walls: np.ndarray, point: np.ndarray, max_range: float) -> n
     return np.vstack([ring, ring[:1]])
 
 
-def windows(walls: np.ndarray, point: np.ndarray, max_range: float, area: shapely.Polygon) -> list[np.ndarray]:
-    """The border of a point's viewer region within `area`: polylines (k, 2).
+def windows(
+    walls: np.ndarray, point: np.ndarray, max_range: float, area: shapely.Polygon, start: np.ndarray
+) -> list[np.ndarray]:
+    """The border of a point's viewer region within `area`: polylines (k, 2); none if `start` (2,) is in the region.
 
-    Who comes from outside the region to see the point (2,) crosses one of them. Where a sight line ends at a wall the
-    disc's centre cannot be, so only the open part of the border lies in the area.
+    Who comes from the start to see the point (2,) crosses one of them. Where a sight line ends at a wall the disc's
+    centre cannot be, so only the open part of the border lies in the area.
     """
     border = shapely.LineString(visibility_ring(walls, point, max_range))
+    if not border.intersects(shapely.LineString([point, start])):
+        return []
     inside = shapely.intersection(border, area)
     lines = [np.asarray(line.coords) for line in shapely.get_parts(inside) if line.geom_type == "LineString"]
     return [line for line in lines if len(line) > 1]

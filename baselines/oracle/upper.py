@@ -16,7 +16,7 @@ from numba import njit
 from baselines.oracle.sight import Checkpoints
 from baselines.oracle.space import Space
 
-_LOOK = 0.25
+LOOK = 0.25
 """On the way the sensor looks at most every so many metres: fewer looks than it takes, so the tour is complete."""
 _UNIT = 1e-3
 """Unit of the tour solver's integer lengths, m."""
@@ -110,7 +110,7 @@ class Planner:
         key = (p.tobytes(), q.tobytes())
         if key not in self._edges:
             turned = (key[1], key[0])
-            self._edges[key] = self._edges[turned] if turned in self._edges else self.sight.seen_along(p, q, _LOOK)
+            self._edges[key] = self._edges[turned] if turned in self._edges else self.sight.seen_along(p, q, LOOK)
         return self._edges[key]
 
     def length(self, stops: list[int]) -> float:
