@@ -49,6 +49,8 @@ _TABLE = 1e7
 """Largest effort of an exact table; beyond it the linear program bounds the tour."""
 _IDLE = 1e-3
 """A witness that adds less than this (m) to an exact tour may make room for another."""
+_AFTER = 1e8
+"""Most effort of linear programs that follow exact tables."""
 _TURN = 1e6
 """Effort of everything else in a turn."""
 _ROUNDS = 60
@@ -181,6 +183,8 @@ class _Search:
                 pairs, shares = np.stack([[-1, *order[:-1]], order], axis=1), np.ones(len(order))
                 spent += steps
             else:
+                if len(cuts.idle) == 0 and spent > 0.0:  # after exact tables there is little left to gain
+                    effort = min(effort, spent + _AFTER)
                 solution = Tour(gates.owner, gates.first, gates.between, cuts, columns).solve(_ROUNDS, effort - spent)
                 length, taken, pairs, shares = solution.bound, solution.taken, solution.pairs, solution.shares
                 cuts, columns = solution.cuts, solution.columns

@@ -102,8 +102,7 @@ class Tour:
         self._known = np.eye(self.size, dtype=bool) | self._same
         self._pairs = np.zeros((0, 2), np.int64)
         self._solver = highspy.Highs()
-        self._solver.setOptionValue("log_to_console", False)
-        for name, value in (("threads", 1), ("presolve", "off"), ("random_seed", 0)):
+        for name, value in (("output_flag", False), ("threads", 1), ("presolve", "off"), ("random_seed", 0)):
             self._solver.setOptionValue(name, value)
         self._work = 0.0
         self._build()
