@@ -26,6 +26,9 @@ _TRAIL_STEP = 0.3
 """Spacing of the way points on a way driven, m."""
 _AT_NODE = 0.75
 """A jump edge counts as measured from its node only within this distance (m) of where that should be."""
+_ON_EDGE = 0.4
+_AHEAD = 0.5
+"""And, farther than this (m) from its middle, only with this cosine or more to its normal."""
 _SPARE = 0.05
 """Paths round corners keep this much more than the robot's radius, m."""
 
@@ -73,7 +76,7 @@ class Chains:
     kind: np.ndarray
     """(c,) `scan_polygon` label of most of it."""
     visits: np.ndarray
-    """(c,) measurements made or attempted for it in vain."""
+    """(c,) measurements made for it in vain, and attempts that ended before its node, which count half."""
     node: np.ndarray
     """(c, 3) position and heading of the node."""
     vertex: np.ndarray
@@ -129,7 +132,7 @@ class ExplorationMap:
         self.angles = np.zeros(n)
         self.pieces = np.zeros((0, 4))
         self.kinds = np.zeros(0, np.int8)
-        self.visits = np.zeros(0, np.int64)
+        self.visits = np.zeros(0, np.int64)  # in halves: an attempt that ends before the node counts half
         self.done = np.zeros(0, np.bool_)
         self.owner = np.zeros(0, np.int64)
         self.chains = Chains.none()
@@ -190,14 +193,22 @@ class ExplorationMap:
         dirty = np.zeros(len(self.pieces), np.bool_)
         dirty[local[changed]] = True
         if target is not None:
-            row = np.flatnonzero(self.chains.id == target)
-            near = self.config.front_distance if self.config.placement == "in_front" else 0.0
-            if len(row) and math.dist(self.chains.middle[row[0]], (x, y)) > near + _AT_NODE:
-                arrived = False  # a look from afar is an attempt, not a measurement from its node
             mine = self.owner == target
-            self.visits[mine] += 1
+            arrived = arrived and self._measured(target, x, y)
+            self.visits[mine] += 2 if arrived else 1
             dirty |= mine
         self._rechain(local, kept, origin, dirty, fresh, fresh_kinds, s, target if arrived else None)
+
+    def _measured(self, target: int, x: float, y: float) -> bool:
+        """Whether a scan from (x, y) measures a jump edge; a look from afar or from the side is an attempt only."""
+        row = np.flatnonzero(self.chains.id == target)
+        if not len(row):
+            return True
+        dx, dy = self.chains.middle[row[0]] - (x, y)
+        distance = math.hypot(dx, dy)
+        ahead = dx * self.chains.normal[row[0], 0] + dy * self.chains.normal[row[0], 1]
+        front = self.config.front_distance if self.config.placement == "in_front" else 0.0
+        return distance <= front + _AT_NODE and (distance <= _ON_EDGE or ahead >= _AHEAD * distance)
 
     def _store(self, scan: Scan, ranges: np.ndarray) -> int:
         s = self.n_scans
@@ -243,7 +254,7 @@ class ExplorationMap:
         self.pieces, self.kinds, self.visits, self.done, self.owner, ids, data, ends, kind, visits = (
             jump_edges.rechain(
                 self.pieces, self.kinds, self.visits, self.done, self.owner, dirty, local, kept, origin, fresh,
-                fresh_kinds, finished, self.config.max_visits, self.join, self.min_gap, self.sensor.max_range,
+                fresh_kinds, finished, 2 * self.config.max_visits, self.join, self.min_gap, self.sensor.max_range,
                 self._next_id,
             )
         )  # fmt: skip
@@ -258,13 +269,13 @@ class ExplorationMap:
         for q, row in zip(long_enough, again, strict=True):
             if row >= 0:
                 self.owner[self.owner == ids[q]] = c.id[row]
-                c.visits[row], c.kind[row] = visits[q], kind[q]
+                c.visits[row], c.kind[row] = (visits[q] + 1) // 2, kind[q]
                 staying[row] = True
         self._drop_vertices(c.vertex[~staying])
         new = long_enough[again < 0]
         m = len(new)
         added = Chains(
-            ids[new], data[new, 0], data[new, 1:3], data[new, 3:5], ends[new], kind[new], visits[new],
+            ids[new], data[new, 0], data[new, 1:3], data[new, 3:5], ends[new], kind[new], (visits[new] + 1) // 2,
             np.zeros((m, 3)), np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
         )  # fmt: skip
         self.chains = c.take(np.flatnonzero(staying)).join(added)

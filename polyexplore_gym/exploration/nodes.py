@@ -70,10 +70,20 @@ def place(which, node, vertex, middle, normal, length, chain, front, spacing, wa
     """
     out = np.zeros((which.size, 3))
     outcome = np.zeros(which.size, np.int8)
+    no_owner = np.full(walls.shape[0], -1, np.int64)
     for k in range(which.size):
         i = which[k]
         if vertex[i] >= 0:
-            if clearance(node[i, 0], node[i, 1], walls, w_start, w_items, REACH) >= need - 0.02:
+            x = node[i, 0]
+            y = node[i, 1]
+            # Walls that came later may stand too near, or between the node and its jump edge.
+            if clearance(x, y, walls, w_start, w_items, REACH) >= need - 0.02 and (
+                math.hypot(middle[i, 0] - x, middle[i, 1] - y) < 2.0 * _ASIDE
+                or crossing_free(
+                    x, y, middle[i, 0] - _ASIDE * normal[i, 0], middle[i, 1] - _ASIDE * normal[i, 1], walls, w_start,
+                    w_items, no_owner, -2, -2, 0.0, _SIGHT,
+                )
+            ):  # fmt: skip
                 continue
             outcome[k] = 1
         d = min(front, length[i] / spacing)
