@@ -198,6 +198,8 @@ class ExplorationMap:
             self.visits[mine] += 2 if arrived else 1
             dirty |= mine
         self._rechain(local, kept, origin, dirty, fresh, fresh_kinds, s, target if arrived else None)
+        if target is not None:
+            self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
     def _measured(self, target: int, x: float, y: float) -> bool:
         """Whether a scan from (x, y) measures a jump edge; a look from afar or from the side is an attempt only."""
@@ -280,6 +282,10 @@ class ExplorationMap:
         )  # fmt: skip
         self.chains = c.take(np.flatnonzero(staying)).join(added)
 
+    def _drop_nodes(self, which: np.ndarray) -> None:
+        self._drop_vertices(self.chains.vertex[which])
+        self.chains.vertex[which] = -1
+
     def _drop_vertices(self, vertices: np.ndarray) -> None:
         vertices = vertices[vertices >= 0]
         if len(vertices):
@@ -300,11 +306,7 @@ class ExplorationMap:
         """
         g, c = self.graph, self.chains
         if self._touched:
-            n = self.n_scans
-            known = Known(
-                self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range
-            )
-            g.set_walls(walls, alive, np.unique(np.concatenate(self._touched)), known, self._box)
+            g.set_walls(walls, alive, np.unique(np.concatenate(self._touched)), self._known(), self._box)
             g.set_pieces(self.pieces, self.owner, self._box)
             g.add_way_point(float(pose[0]), float(pose[1]))
         if self.robot >= 0:
@@ -332,6 +334,10 @@ class ExplorationMap:
         g.recycle()
         self._touched = []
         self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
+
+    def _known(self) -> Known:
+        n = self.n_scans
+        return Known(self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range)
 
     def _way_out(self, x: float, y: float, came: np.ndarray | None) -> list[tuple[float, float]]:
         """The first way points: the place itself or, in contact with a wall, on to where paths begin."""
@@ -368,8 +374,7 @@ class ExplorationMap:
             config.samples * self.sensor.resolution, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner,
             g.need,
         )  # fmt: skip
-        self._drop_vertices(c.vertex[which[outcome > 0]])
-        c.vertex[which[outcome > 0]] = -1
+        self._drop_nodes(which[outcome > 0])
         self._set_nodes(which[outcome == 2], node[outcome == 2])
 
     def _place_within(self, which: np.ndarray, through_unknown: bool = False) -> None:
@@ -377,13 +382,12 @@ class ExplorationMap:
         if not len(which):
             return
         g, c = self.graph, self.chains
-        seen = g.reachable(self.robot)
+        seen, known = g.reachable(self.robot), self._known()
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
         for k, i in enumerate(which):
             *node[k], found[k] = nodes.nearest_reachable(
                 np.flatnonzero(self.owner == c.id[i]), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
-                self.sensor.max_range, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK,
-                through_unknown,
+                known, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK, through_unknown,
             )  # fmt: skip
         if found.any():
             self._drop_vertices(c.vertex[which[found]])

@@ -14,6 +14,8 @@ _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
 _OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0])
 _ASIDE = 0.15
 """Distance (m) from a jump edge of the point that must be visible."""
+_SAME_PLACE = 0.4
+"""A scan within this distance (m, in x and in y) was made at the same place."""
 _SIGHT = 0.05
 """A line of sight may end within this distance (m) of its target's own walls."""
 
@@ -117,13 +119,27 @@ def _joins(x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p
 
 
 @njit(cache=True)
-def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_range, walls, w_start, w_items,
-                      pieces, p_start, p_items, owner, need, slack, through_unknown):  # fmt: skip
+def looked_from(x, y, tx, ty, known):
+    """Whether a scan from (x, y) or beside it had (tx, ty) in its field of view: another would show no more."""
+    for s in range(known.headings.size):
+        dx = known.apexes[s, 0] - x
+        dy = known.apexes[s, 1] - y
+        if abs(dx) < _SAME_PLACE and abs(dy) < _SAME_PLACE:
+            turn = math.atan2(ty - y, tx - x) - known.headings[s]
+            turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
+            if known.full or known.angles[0] + 0.1 < turn < known.angles[-1] - 0.1:
+                return True
+    return False
+
+
+@njit(cache=True)
+def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, known, walls, w_start, w_items, pieces,
+                      p_start, p_items, owner, need, slack, through_unknown):  # fmt: skip
     """The reachable place nearest to a jump edge from which it is visible: (x, y, heading, found).
 
     Tries places before the edge on its known side, then the vertices of the graph in `seen`; with
     `through_unknown` also those between which and the edge there are no known walls but other jump
-    edges. The heading looks at the edge.
+    edges. The heading looks at the edge. Places from which a scan has looked at it are left out.
     """
     no_owner = np.full(walls.shape[0], -1, np.int64)
     for offset in _OFFSETS:
@@ -133,6 +149,8 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
             px, py = point_along(rows, pieces, fraction)
             x = px - offset * nx
             y = py - offset * ny
+            if looked_from(x, y, px, py, known):
+                continue
             if stands(
                 x, y, px, py, chain, walls, w_start, w_items, pieces, p_start, p_items, owner, need
             ) and _joins(
@@ -143,7 +161,7 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
     # A jump edge begins at the corner that hides what is behind it: aim beside it, on its known side.
     tx = mx - _ASIDE * nx
     ty = my - _ASIDE * ny
-    best = 0.8 * max_range
+    best = 0.8 * known.reach
     bx = 0.0
     by = 0.0
     found = False
@@ -163,7 +181,7 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, max_ran
                 position[v, 0], position[v, 1], tx, ty, walls, w_start, w_items, pieces, p_start, p_items, owner,
                 chain, chain,
             )  # fmt: skip
-        if visible:
+        if visible and not looked_from(position[v, 0], position[v, 1], tx, ty, known):
             best = d
             bx = position[v, 0]
             by = position[v, 1]
