@@ -113,6 +113,20 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """Make one HTML page of the results of `bench`, also while they are not complete."""
+
+    results: tyro.conf.Positional[Path]
+    """Folder of the results."""
+    out: Path | None = None
+    """The page (default: report.html in that folder)."""
+    reference: str = "nearest"
+    """Policy that the others are compared with."""
+    runs: int = 3
+    """So many of the best and of the worst runs are run again and drawn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
@@ -193,6 +207,14 @@ def bench(options: Bench) -> int:
         except MissingDependencyError as error:
             _say(f"no plots: {error}")
     _say(f"written to {options.out}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+def report(options: Report) -> int:
+    """Write the page of a results folder."""
+    from polyexplore_gym.evaluation.report import write_report
+
+    print(f"written: {write_report(options.results, options.out, reference=options.reference, runs=options.runs)}")
     return 0
 
 
@@ -298,6 +320,7 @@ def linemap(options: Linemap) -> int:
 _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (Bench, bench),
     "run": (Run, run),
+    "report": (Report, report),
     "linemap": (Linemap, linemap),
 }
 

@@ -111,7 +111,8 @@ def test_commands_run_in_order(reader, capsys):
         extra = ["--workers", "1", "--no-plots", "--drive", "kinematic"] if words[0] == "bench" else []
         capsys.readouterr()
         assert cli.main([*words, *extra]) == 0, command
-        assert {"run": "distance", "bench": "IQM", "linemap": "compression"}[words[0]] in capsys.readouterr().out
+        told = {"run": "distance", "bench": "IQM", "linemap": "compression", "report": "written"}
+        assert told[words[0]] in capsys.readouterr().out
         for option in ("--png", "--out"):
             if option in words:
                 assert Path(words[words.index(option) + 1]).exists()

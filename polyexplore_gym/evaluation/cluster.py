@@ -8,6 +8,7 @@ core, and runs it again, up to three times, when its worker dies.
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 from collections.abc import Callable, Iterator
@@ -35,7 +36,9 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
     try:
         import ray
     except ImportError as error:
-        raise MissingDependencyError('the backend ray needs Ray: pip install "polyexplore-gym[ray]"') from error
+        raise MissingDependencyError(
+            f'the backend ray needs Ray: pip install "polyexplore-gym[ray]" ({error})'
+        ) from error
     ours = not ray.is_initialized()
     if ours:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -44,7 +47,7 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
         try:
             if host:  # nobody there? Ray itself would try for minutes
                 socket.create_connection((host.strip("[]"), int(port)), timeout=20).close()
-            ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
+            ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **local)
         except (OSError, RuntimeError, ValueError) as error:
             raise InvalidConfigError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from error
     try:

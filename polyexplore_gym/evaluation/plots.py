@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from polyexplore_gym.evaluation.episode import run_episode
 from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
-from polyexplore_gym.evaluation.statistics import coverage_at, mean_band
+from polyexplore_gym.evaluation.statistics import Interval, coverage_at, mean_band, proportion_band
 from polyexplore_gym.evaluation.summary import Comparison, Summary, completed
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
 _DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (4, 1.5, 1, 1.5)))
 _INK = "#333333"
+BANDS = 4
+"""So many bands can be told apart in one panel."""
 
 
 def coverage_figure(
@@ -35,7 +38,8 @@ def coverage_figure(
 
     Distances are divided by what the reference policy drove on the same plan, start and placement to
     complete the map, so that small and large plans can be averaged. Only starts that all policies
-    completed at a placement are in it (as in `summarize`); one panel a placement.
+    completed at a placement are in it (as in `summarize`); one panel a placement. Of many policies only the
+    reference has its interval.
     """
     placements = list(dict.fromkeys(r.placement for r in records))
     policies = list(dict.fromkeys(r.policy for r in records))
@@ -64,44 +68,102 @@ def coverage_figure(
             color, dash = _style(policies.index(policy))
             mean, low, high = 100 * mean_band(curves, [r.group for r in runs], [r.stratum for r in runs])
             panel.plot(grid, mean, color=color, linestyle=dash, linewidth=1.6, label=policy)
-            panel.fill_between(grid, low.clip(0, 100), high.clip(0, 100), color=color, alpha=0.12, linewidth=0)
+            if policy in (compared if len(compared) <= BANDS else [base]):
+                panel.fill_between(grid, low.clip(0, 100), high.clip(0, 100), color=color, alpha=0.12, linewidth=0)
         panel.set_title(f"{placement} ({len(pairs)} starts)", fontsize=10, color=_INK)
         panel.set_xlabel(f"distance / that of {base} until complete" if base else "distance", fontsize=9)
         panel.set_xlim(0.0, grid[-1])
         _plain(panel)
     panels[0].set_ylabel("area seen, %", fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    if handles:
-        panels[-1].legend(handles, labels, fontsize=8, frameon=False, loc="lower right")
+    _legend(panels, "lower right")
+    return figure
+
+
+def profile_figure(records: Sequence[EpisodeRecord], *, reference: str = "nearest") -> Figure:
+    """Performance profiles (Dolan and More 2002): how often a policy is how much longer than the best one.
+
+    The share of starts on which its distance is at most so many times the shortest of all policies at that
+    placement, with its 95 % interval. What was not completed is infinitely long. Starts that all policies
+    ran and one completed are in it; one panel a placement. Of many policies only the reference has its interval.
+    """
+    placements = list(dict.fromkeys(r.placement for r in records))
+    policies = list(dict.fromkeys(r.policy for r in records))
+    done = {r.key for r in completed(records)}
+    figure = _figure(4.6 * len(placements) + 0.4, 3.9)
+    panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
+    for panel, placement in zip(panels, placements, strict=True):
+        found = {(r.policy, r.plan_hash, r.seed): r for r in records if r.placement == placement}
+        ran = [p for p in policies if any(key[0] == p for key in found)]
+        starts = [key[1:] for key in found if key[0] == ran[0] and all((p, *key[1:]) in found for p in ran)]
+        runs = np.array([[found[(p, *start)] for p in ran] for start in starts], dtype=object).reshape(-1, len(ran))
+        distance = np.array([[r.distance if r.key in done else np.inf for r in row] for row in runs])
+        kept = np.isfinite(distance).any(axis=1) if len(runs) else np.zeros(0, dtype=bool)
+        runs, distance = runs[kept], distance.reshape(-1, len(ran))[kept]
+        if len(runs):
+            best = distance.min(axis=1, keepdims=True)
+            ratio = np.where(best > 0, distance / np.where(best > 0, best, 1.0), np.where(distance > 0, np.inf, 1.0))
+            last = float(np.clip(np.quantile(ratio[np.isfinite(ratio)], 0.95), 1.2, 10.0))
+            grid = np.geomspace(1.0, last, 201)
+            for i, policy in enumerate(ran):
+                within = (ratio[:, i, None] <= grid * (1 + 1e-9)).astype(np.float64)
+                share, low, high = 100 * proportion_band(within, [r.group for r in runs[:, i]])
+                color, dash = _style(policies.index(policy))
+                panel.plot(grid, share, color=color, linestyle=dash, linewidth=1.6, label=policy)
+                if policy in (ran if len(ran) <= BANDS else [reference]):
+                    panel.fill_between(grid, low, high, color=color, alpha=0.12, linewidth=0)
+            panel.set_xscale("log")
+            panel.set_xlim(1.0, last)
+            _ratio_ticks(panel, 1.0, last)
+        panel.set_title(f"{placement} ({len(runs)} starts)", fontsize=10, color=_INK)
+        panel.set_xlabel("distance / the shortest on that start, at most", fontsize=9)
+        panel.set_ylim(0, 103)
+        _plain(panel)
+    panels[0].set_ylabel("starts, %", fontsize=9)
+    _legend(panels, "lower right")
     return figure
 
 
 def ratio_figure(summary: Summary) -> Figure:
     """Distance over that of the reference: every start a dot, the geometric mean with its interval above it."""
     comparisons = [*summary.against_reference, *summary.between_placements]
-    comparisons = [c for c in comparisons if c.pairs]
-    figure = _figure(7.0, 1.3 + 0.42 * max(len(comparisons), 1))
+    return comparison_figure(comparisons, [_versus(c) for c in comparisons])
+
+
+def comparison_figure(comparisons: Sequence[Comparison], labels: Sequence[str], *, width: float = 7.0) -> Figure:
+    """As `ratio_figure`, for some comparisons with names of one's own; `width` in inches."""
+    rows = [(c, label) for c, label in zip(comparisons, labels, strict=True) if c.pairs]
+    figure = _figure(width, 1.3 + 0.42 * max(len(rows), 1))
     panel = figure.subplots()
     span = [1.0]
-    for row, c in enumerate(comparisons):
+    for row, (c, _) in enumerate(rows):
         ratios = np.array(c.ratios)
         span += [float(np.quantile(ratios, 0.02)), float(np.quantile(ratios, 0.98)), c.ratio.low, c.ratio.high]
         # A fixed ripple keeps dots apart; it means nothing.
         ripple = 0.11 * np.sin(2.4 * np.arange(len(ratios)))
         panel.scatter(ratios, row + 0.2 + ripple, s=7, color="#8a8a8a", alpha=0.5, linewidths=0)
-        color = _COLORS[0] if c.ours[1] == c.theirs[1] else _COLORS[1]
-        panel.plot([c.ratio.low, c.ratio.high], [row - 0.12] * 2, color=color, linewidth=2.4, solid_capstyle="round")
-        panel.plot([c.ratio.estimate], [row - 0.12], "o", color=color, markersize=5.5)
+        _whisker(panel, c, c.ratio, row - 0.12)
     panel.axvline(1.0, color=_INK, linewidth=0.8, zorder=0)
-    panel.set_yticks(range(len(comparisons)), [_versus(c) for c in comparisons], fontsize=8)
-    panel.set_ylim(len(comparisons) - 0.4, -0.6)
+    _rows(panel, [label for _, label in rows])
     panel.set_xscale("log")
     low, high = np.nanmin(span) / 1.05, np.nanmax(span) * 1.05
     panel.set_xlim(low, high)
-    ticks = [t for t in (0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 1, 1.1, 1.25, 1.5, 2, 3, 4, 6, 10) if low <= t <= high]
-    panel.set_xticks(ticks, [f"{t:g}" for t in ticks])
-    panel.minorticks_off()
-    panel.set_xlabel("ratio of the distances until the map is complete (left of 1: shorter)", fontsize=9)
+    _ratio_ticks(panel, low, high)
+    panel.set_xlabel("ratio of the distances (below 1: shorter)", fontsize=9)
+    _plain(panel)
+    return figure
+
+
+def improvement_figure(comparisons: Sequence[Comparison], labels: Sequence[str], *, width: float = 7.0) -> Figure:
+    """The probability that ours is the shorter way on a start, with its interval; `width` in inches."""
+    rows = [(c, label) for c, label in zip(comparisons, labels, strict=True) if c.pairs]
+    figure = _figure(width, 1.1 + 0.3 * max(len(rows), 1))
+    panel = figure.subplots()
+    for row, (c, _) in enumerate(rows):
+        _whisker(panel, c, c.improvement, row)
+    panel.axvline(0.5, color=_INK, linewidth=0.8, zorder=0)
+    _rows(panel, [label for _, label in rows])
+    panel.set_xlim(-0.02, 1.02)
+    panel.set_xlabel("probability of the shorter way (above 0.5: better)", fontsize=9)
     _plain(panel)
     return figure
 
@@ -141,6 +203,24 @@ def trajectory_figure(
     return figure
 
 
+def run_figure(
+    env: Any, policy: Policy, plan: Any, seed: int, *, label: str, width: float = 5.2
+) -> tuple[Figure, EpisodeRecord]:
+    """The way of one policy on one plan from the ring to the robot, run again, and its record; raises as `replay`."""
+    from polyexplore_gym.rendering import draw
+
+    snapshot, record = replay(env, policy, plan, seed, label=label)
+    width = min(width, 5.0 / _shape(plan))
+    height = width * _shape(plan) + 0.3  # inches, with the scale bar below the map
+    figure = _figure(width, height)
+    figure.set_layout_engine("none")
+    panel = figure.add_axes((0.01, 0.3 / height, 0.98, 1.0 - 0.32 / height))
+    draw(dataclasses.replace(snapshot, scan=None, path=np.zeros((0, 2))), panel, text=False)
+    start = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "markeredgewidth": 1.8, "zorder": 6}
+    panel.plot(*snapshot.trajectory[0, :2], color=_COLORS[1], **start)
+    return figure, record
+
+
 def replay(env: Any, policy: Policy, plan: Any, seed: int, *, label: str) -> tuple[Any, EpisodeRecord]:
     """The last snapshot of an episode that is run again, and its record; raises `ResultsError` if it fails."""
     last: list[Any] = []
@@ -170,6 +250,34 @@ def _figure(width: float, height: float) -> Figure:
     except ImportError as error:
         raise MissingDependencyError('plots need matplotlib: pip install "polyexplore-gym[plots]"') from error
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def _legend(panels: np.ndarray, place: str) -> None:
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        panels[-1].legend(handles, labels, fontsize=8, frameon=False, loc=place)
+
+
+def _whisker(panel: Any, c: Comparison, value: Interval, height: float) -> None:
+    color = _COLORS[0] if c.ours[1] == c.theirs[1] else _COLORS[1]
+    panel.plot([value.low, value.high], [height] * 2, color=color, linewidth=2.4, solid_capstyle="round")
+    panel.plot([value.estimate], [height], "o", color=color, markersize=5.5)
+
+
+def _rows(panel: Any, labels: Sequence[str]) -> None:
+    panel.set_yticks(range(len(labels)), labels, fontsize=8)
+    panel.set_ylim(len(labels) - 0.4, -0.6)
+
+
+def _ratio_ticks(panel: Any, low: float, high: float) -> None:
+    """Round ratios on a logarithmic axis, the roundest first, as many as there is room for."""
+    ticks: list[float] = []
+    for mark in (1, 2, 0.5, 1.5, 4, 0.7, 3, 10, 1.25, 0.8, 1.1, 6, 0.3, 0.9, 0.6, 1.05, 1.2):
+        apart = [abs(np.log(mark / tick)) for tick in ticks]
+        if low <= mark <= high and min(apart, default=np.inf) > 0.07 * np.log(high / low):
+            ticks.append(mark)
+    panel.set_xticks(sorted(ticks), [f"{t:g}" for t in sorted(ticks)])
+    panel.minorticks_off()
 
 
 def _plain(panel: Any) -> None:

@@ -2,6 +2,7 @@
 
     manifest.json    the study (configuration, policies, plans with their hashes, seeds) and versions
     episodes.jsonl   `EpisodeRecord`s in the order in which they ended; only ever appended to
+    plans/           the floor plans, named after their hashes, so that runs can be drawn later
 
 A line counts once it is on the disk, so a run that was killed goes on where it was: `ResultsFile`
 cuts off a damaged last line and lists the episodes that are there.
@@ -14,19 +15,25 @@ import errno
 import json
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from polyexplore_gym.errors import ResultsError
 from polyexplore_gym.evaluation.records import EpisodeRecord, Key
 
+if TYPE_CHECKING:
+    from polyexplore_gym.floorplan import FloorPlan
+
 MANIFEST = "manifest.json"
 EPISODES = "episodes.jsonl"
+PLANS = "plans"
 
 
-def open_folder(folder: Path, manifest: Mapping[str, Any]) -> None:
+def open_folder(folder: Path, manifest: Mapping[str, Any], plans: Iterable[FloorPlan] = ()) -> None:
     """Start a results folder, or check that an earlier start of it belongs to the same study.
+
+    The plans are kept in it, those of them that are not there yet.
 
     Raises:
         ResultsError: the folder cannot be made or read, or belongs to another study (the message
@@ -37,6 +44,7 @@ def open_folder(folder: Path, manifest: Mapping[str, Any]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             _check_same(path, manifest)
+            _keep_plans(folder, plans)
             return
         if (folder / EPISODES).exists():
             raise ResultsError(f"{folder}: holds {EPISODES} but no {MANIFEST}: choose another folder")
@@ -47,8 +55,17 @@ def open_folder(folder: Path, manifest: Mapping[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+        _keep_plans(folder, plans)
     except OSError as error:
         raise ResultsError(f"{folder}: cannot be used for results: {_reason(error)}") from error
+
+
+def read_plan(folder: Path, content_hash: str) -> FloorPlan | None:
+    """The plan of that hash; None when the folder does not have it, as folders of earlier versions do not."""
+    from polyexplore_gym.floorplan import load_plan
+
+    path = _plan_path(folder, content_hash)
+    return load_plan(path) if path.exists() else None
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -162,6 +179,22 @@ def _parse(path: Path, data: bytes) -> tuple[dict[Key, EpisodeRecord], int]:
         records[record.key] = record
         good += len(line)
     return records, good
+
+
+def _plan_path(folder: Path, content_hash: str) -> Path:
+    return Path(folder) / PLANS / f"{content_hash[:16]}.json"
+
+
+def _keep_plans(folder: Path, plans: Iterable[FloorPlan]) -> None:
+    from polyexplore_gym.floorplan import save_plan
+
+    (folder / PLANS).mkdir(exist_ok=True)
+    for plan in plans:
+        path = _plan_path(folder, plan.content_hash)
+        if not path.exists():
+            temporary = path.with_suffix(".tmp.json")
+            save_plan(plan, temporary)
+            temporary.replace(path)
 
 
 def _check_same(path: Path, manifest: Mapping[str, Any]) -> None:

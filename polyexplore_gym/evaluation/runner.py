@@ -171,7 +171,7 @@ def evaluate(
     with ExitStack() as stack:
         append: Callable[[EpisodeRecord], None] = lambda record: done.__setitem__(record.key, record)  # noqa: E731
         if out is not None:
-            open_folder(Path(out), study.manifest())
+            open_folder(Path(out), study.manifest(), study.plans)
             file = stack.enter_context(ResultsFile(Path(out)))
             done, append = file.records, file.append
             known = {task.key for task in tasks}

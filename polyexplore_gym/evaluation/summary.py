@@ -158,10 +158,7 @@ def summarize(
         compared = [p for p in policies if table.completed(p, placement)]
         found = table.rows(policies, compared, placement, common[placement], horizons)
         rows += sorted(found, key=_sort_key)
-        others = [p for p in compared if p != reference]
-        if reference in compared:
-            sides = [((p, placement), (reference, placement)) for p in others]
-            against += table.compare(sides, [common[placement]] * len(sides))
+        against += table.against(reference, compared, placement, common[placement])
     between: list[Comparison] = []
     for placement in placements[1:]:
         sides = [((p, placement), (p, placements[0])) for p in policies]
@@ -169,6 +166,26 @@ def summarize(
         kept = [i for i, p in enumerate(pairs) if p]
         between += table.compare([sides[i] for i in kept], [pairs[i] for i in kept])
     return Summary(reference, rows, against, between, notes)
+
+
+def compare(
+    records: Sequence[EpisodeRecord],
+    rng: np.random.Generator,
+    *,
+    reference: str = "nearest",
+    resamples: int = 2000,
+    confidence: float = 0.95,
+) -> list[Comparison]:
+    """`Summary.against_reference` alone, for a part of the records; empty where the reference completed nothing."""
+    policies = list(dict.fromkeys(r.policy for r in records))
+    by_key = {(r.policy, r.placement, (r.plan_hash, r.seed)): r for r in records}
+    table = _Table(by_key, {r.key for r in completed(records)}, rng, resamples, confidence)
+    found: list[Comparison] = []
+    for placement in dict.fromkeys(r.placement for r in records):
+        compared = [p for p in policies if table.completed(p, placement)]
+        common = _common_pairs(table.completed(p, placement) for p in compared)
+        found += table.against(reference, compared, placement, common)
+    return found
 
 
 def completed(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
@@ -237,6 +254,12 @@ class _Table:
                 counts = complete, ended["complete"] - complete, ended["truncated"], ended["failed"]
                 found.append(Row(policy, placement, len(own), *counts, metrics=metrics[policy]))
         return found
+
+    def against(self, reference: str, compared: list[str], placement: str, pairs: list[Pair]) -> list[Comparison]:
+        if reference not in compared:
+            return []
+        sides = [((p, placement), (reference, placement)) for p in compared if p != reference]
+        return self.compare(sides, [pairs] * len(sides))
 
     def compare(
         self, sides: list[tuple[tuple[str, str], tuple[str, str]]], pairs: list[list[Pair]]

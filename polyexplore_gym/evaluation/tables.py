@@ -23,15 +23,27 @@ ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): 
 same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: the mean stands on so many starts only."""
 
 
-def summary_text(summary: Summary, style: str = "text") -> str:
-    """All tables of a summary, `style` "text" (aligned columns) or "markdown"."""
-    parts = [format_table(_HEADER, [_row(row) for row in summary.rows], style)]
+Table = tuple[str, tuple[str, ...], list[list[str]]]
+"""What it shows (empty: the results themselves), the heads of its columns, its rows."""
+
+
+def summary_tables(summary: Summary) -> list[Table]:
+    """All tables of a summary, the results first."""
+    tables: list[Table] = [("", _HEADER, [_row(row) for row in summary.rows])]
     if summary.against_reference:
         lines = [_comparison(c, c.theirs[0]) for c in summary.against_reference]
-        parts += ["Policies, at the same placement:", format_table(_COMPARISON_HEADER, lines, style)]
+        tables.append(("Policies, at the same placement:", _COMPARISON_HEADER, lines))
     if summary.between_placements:
         lines = [_comparison(c, c.theirs[1]) for c in summary.between_placements]
-        parts += ["Placements, with the same policy:", format_table(_COMPARISON_HEADER, lines, style)]
+        tables.append(("Placements, with the same policy:", _COMPARISON_HEADER, lines))
+    return tables
+
+
+def summary_text(summary: Summary, style: str = "text") -> str:
+    """All tables of a summary, `style` "text" (aligned columns) or "markdown"."""
+    parts: list[str] = []
+    for title, header, rows in summary_tables(summary):
+        parts += [*filter(None, [title]), format_table(header, rows, style)]
     bullet = "- " if style == "markdown" else ""
     parts.append("\n".join(bullet + note for note in summary.notes))
     parts.append(LEGEND)
@@ -123,7 +135,7 @@ def _row(row: Row) -> list[str]:
         row.placement,
         row.policy,
         _counts(row),
-        _interval(distance.mean, 1) if distance and compared else "-",
+        interval_text(distance.mean, 1) if distance and compared else "-",
         _number(distance.iqm.estimate, 1) if distance and compared else "-",
         mean("coverage", 1, 100.0),
         mean("distance_90", 1),
@@ -151,14 +163,15 @@ def _comparison(c: Comparison, against: str) -> list[str]:
         c.ours[0],
         against,
         str(c.pairs),
-        _interval(c.ratio, 3) if c.pairs else "-",
-        _interval(c.improvement, 2) if c.pairs else "-",
+        interval_text(c.ratio, 3) if c.pairs else "-",
+        interval_text(c.improvement, 2) if c.pairs else "-",
         _p(c.p),
         _p(c.p_holm),
     ]
 
 
-def _interval(value: Interval, digits: int) -> str:
+def interval_text(value: Interval, digits: int) -> str:
+    """As in 1.04 [0.99, 1.08]; the estimate alone where there is no interval."""
     if math.isnan(value.low):
         return _number(value.estimate, digits)
     return f"{value.estimate:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"

@@ -16,7 +16,7 @@ from polyexplore_gym.evaluation import (
     summary_text,
     write_tables,
 )
-from polyexplore_gym.evaluation.plots import coverage_figure, ratio_figure, save
+from polyexplore_gym.evaluation.plots import coverage_figure, improvement_figure, profile_figure, ratio_figure, save
 from polyexplore_gym.evaluation.summary import completed
 from polyexplore_gym.evaluation.tables import format_table
 
@@ -213,6 +213,35 @@ def test_figures_show_all_policies(records, tmp_path):
         assert picture.std() > 0.01
     with pytest.raises(ResultsError, match="cannot be written"):
         save(figure, tmp_path / "nowhere" / "x.png")
+
+
+def test_performance_profiles_by_hand():
+    records = []
+    for i, (near, far) in enumerate(((10.0, 20.0), (30.0, 20.0), (10.0, 10.0), (10.0, 15.0))):
+        records += [record("nearest", i, near), record("far", i, far)]
+    records[7] = record("far", 3, 15.0, status="truncated")
+    records.append(record("nearest", 4, 3.0))  # the other has not run there yet
+    records += [record(p, 5, 3.0, status="failed", error="E") for p in ("nearest", "far")]
+    (panel,) = profile_figure(records).axes
+    assert panel.get_title() == "midpoint (4 starts)"
+    lines = {line.get_label(): line.get_data() for line in panel.get_lines()}
+    for policy, ratios in (("nearest", (1.0, 1.5, 1.0, 1.0)), ("far", (2.0, 1.0, 1.0, np.inf))):
+        x, y = lines[policy]
+        share = [100 * np.mean([r <= tau for r in ratios]) for tau in x]
+        off = np.abs(np.array(share) - y) > 1e-9
+        assert not off[np.abs(x[:, None] - [1.0, 1.5, 2.0]).min(axis=1) > 1e-6].any()
+        assert y[0] == {"nearest": 75.0, "far": 50.0}[policy]
+    # Nothing that can be compared.
+    assert profile_figure([record("a", 0, 1.0, status="failed", error="E")]).axes[0].get_lines()[:] == []
+
+
+def test_improvement_shows_every_comparison():
+    records = [record(p, i, d + i) for i in range(4) for p, d in (("nearest", 5.0), ("b", 4.0), ("c", 6.0))]
+    found = figures(records).against_reference
+    (panel,) = improvement_figure(found, [c.ours[0] for c in found]).axes
+    dots = {float(x[0]) for x, _ in (line.get_data() for line in panel.get_lines()) if len(x) == 1}
+    assert dots == {0.0, 1.0}
+    assert [tick.get_text() for tick in panel.get_yticklabels()] == ["b", "c"]
 
 
 def test_giving_up_early_does_not_win():
