@@ -49,7 +49,10 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
                 socket.create_connection((host.strip("[]"), int(port)), timeout=20).close()
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **local)
         except (OSError, RuntimeError, ValueError) as error:
-            raise InvalidConfigError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from error
+            raise InvalidConfigError(
+                f"no Ray cluster at {address}: {str(error).splitlines()[0]} (one that asks for a token takes it from "
+                "RAY_AUTH_TOKEN, with RAY_AUTH_MODE=token)"
+            ) from error
     try:
         yield int(ray.cluster_resources().get("CPU", 1))
     finally:
