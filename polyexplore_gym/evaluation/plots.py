@@ -216,7 +216,13 @@ def run_figure(
     figure.set_layout_engine("none")
     panel = figure.add_axes((0.01, 0.3 / height, 0.98, 1.0 - 0.32 / height))
     draw(dataclasses.replace(snapshot, scan=None, path=np.zeros((0, 2))), panel, text=False)
-    start = {"marker": "o", "markersize": 8, "markerfacecolor": "none", "markeredgewidth": 1.8, "zorder": 6}
+    start: dict[str, Any] = {
+        "marker": "o",
+        "markersize": 8,
+        "markerfacecolor": "none",
+        "markeredgewidth": 1.8,
+        "zorder": 6,
+    }
     panel.plot(*snapshot.trajectory[0, :2], color=_COLORS[1], **start)
     return figure, record
 

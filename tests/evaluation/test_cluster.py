@@ -86,7 +86,7 @@ def test_what_goes_wrong_on_ray_is_told(ray, tmp_path, monkeypatch):
     def study(*policies) -> Study:
         return Study(policies=name_policies(policies), plans=[plan(i) for i in range(4)])
 
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    ray.init("local", num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     deaths = tmp_path / "deaths"
     deaths.mkdir()
     arguments = {"out": tmp_path / "ray", "workers": 2, "backend": "ray", "progress": False, "make_env": FakeEnv}
