@@ -31,7 +31,7 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
 
     Raises:
         MissingDependencyError: Ray is not installed.
-        InvalidConfigError: there is no cluster at the address.
+        InvalidConfigError: there is no cluster at the address, or none can be started.
     """
     try:
         import ray
@@ -48,10 +48,13 @@ def cluster(address: str | None, workers: int) -> Iterator[int]:
             if host:  # nobody there? Ray itself would try for minutes
                 socket.create_connection((host.strip("[]"), int(port)), timeout=20).close()
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **local)
-        except (OSError, RuntimeError, ValueError) as error:
+        except Exception as error:  # Ray raises a bare one when it does not come up in time
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if not address:
+                raise InvalidConfigError(f"Ray does not start on this machine: {reason}") from error
             raise InvalidConfigError(
-                f"no Ray cluster at {address}: {str(error).splitlines()[0]} (one that asks for a token takes it from "
-                "RAY_AUTH_TOKEN, with RAY_AUTH_MODE=token)"
+                f"no Ray cluster at {address}: {reason} (one that asks for a token takes it from RAY_AUTH_TOKEN, with "
+                "RAY_AUTH_MODE=token)"
             ) from error
     try:
         yield int(ray.cluster_resources().get("CPU", 1))
