@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from polyexplore_gym.mapping import LaserLog, LogMap
     from polyexplore_gym.snapshot import Snapshot
 
-BENCH_PLANS = {"home-test": 12, "angled-test": 4, "office-test": 2}
+BENCH_PLANS = {"home-test": 24, "angled-test": 12, "office-test": 12}
 """What `polyexplore bench` runs on unless told otherwise: so many of the first plans of these suites.
 
 All scripted policies and both placements then take about three minutes on two cores.
