@@ -1,6 +1,6 @@
 """Upper bounds: the best offline tours known, for sensing all along the way and for scans at stops only.
 
-View planning: a greedy set cover of the checkpoints by places, an open tour through them by OR-tools, then prune,
+View planning: a greedy set cover of the checkpoints by places, an open tour through them by PyVRP, then prune,
 shift, and destroy-and-repair on exact ways. Nothing here is optimal; every tour is complete and can be driven.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -20,6 +21,7 @@ LOOK = 0.25
 """On the way the sensor looks at most every so many metres: fewer looks than it takes, so the tour is complete."""
 _UNIT = 1e-3
 """Unit of the tour solver's integer lengths, m."""
+_TOUR_ITERATIONS = 200
 _FIELDS = 2000
 """Fields of distances kept."""
 _CANDIDATES = 400
@@ -216,7 +218,7 @@ class Planner:
             best = int(np.argmax(gain))
 
     def order(self, stops: list[int]) -> list[int]:
-        """The stops in the order of a short open tour from the first, by OR-tools (local search, no clock)."""
+        """The stops in the order of a short open tour from the first, by PyVRP."""
         between = np.array([[self.distance(a, b) for b in stops] for a in stops])
         return [stops[i] for i in open_tour(between)]
 
@@ -341,26 +343,24 @@ class Planner:
 def open_tour(between: np.ndarray) -> list[int]:
     """A short open tour from row 0 through all rows of a symmetric matrix (k, k), m: the order of the rows.
 
-    OR-tools' routing: cheapest insertion, then local search until no move helps. The same on every machine and run.
+    PyVRP's iterated local search, one vehicle that need not come back; so many iterations, not seconds.
     """
-    from ortools.constraint_solver import pywrapcp, routing_enums_pb2
+    from pyvrp import Client, Depot, Location, ProblemData, VehicleType, solve
+    from pyvrp.stop import MaxIterations
 
     size = len(between)
     if size < 3:
         return list(range(size))
-    lengths = np.rint(between / _UNIT).astype(int)
-    lengths = np.block(
-        [[lengths, np.zeros((size, 1), int)], [np.zeros((1, size + 1), int)]]
-    )  # to the end from anywhere
-    manager = pywrapcp.RoutingIndexManager(size + 1, 1, [0], [size])
-    routing = pywrapcp.RoutingModel(manager)
-    routing.SetArcCostEvaluatorOfAllVehicles(routing.RegisterTransitMatrix(lengths.tolist()))
-    search = pywrapcp.DefaultRoutingSearchParameters()
-    search.first_solution_strategy = routing_enums_pb2.FirstSolutionStrategy.PARALLEL_CHEAPEST_INSERTION
-    search.local_search_metaheuristic = routing_enums_pb2.LocalSearchMetaheuristic.GREEDY_DESCENT
-    solution = routing.SolveWithParameters(search)
-    at, order = routing.Start(0), []
-    while not routing.IsEnd(at):
-        order.append(manager.IndexToNode(at))
-        at = solution.Value(routing.NextVar(at))
-    return order
+    lengths: Any = np.zeros((size + 1, size + 1), np.int64)  # the last place: the end, at no way from anywhere
+    lengths[:size, :size] = np.rint(between / _UNIT)
+    data = ProblemData(
+        locations=[Location(0, 0) for _ in range(size + 1)],
+        clients=[Client(place) for place in range(1, size)],
+        depots=[Depot(0), Depot(size)],
+        vehicle_types=[VehicleType(1, start_depot=0, end_depot=1)],
+        distance_matrices=[lengths],
+        duration_matrices=[np.zeros_like(lengths)],
+    )
+    result = solve(data, MaxIterations(_TOUR_ITERATIONS), seed=0, display=False, collect_stats=False)
+    (route,) = result.best.routes()
+    return [0, *(stop.idx + 1 for stop in route if stop.is_client())]

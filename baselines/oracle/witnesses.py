@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import highspy
 import numpy as np
-from ortools.graph.python import max_flow
 from scipy.cluster.hierarchy import linkage
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 _SCALE = 1_000_000
 _VIOLATED = 0.02
@@ -302,14 +302,12 @@ def _smallest_cut(
 ) -> tuple[int, np.ndarray]:
     """Flow from node 0 to the sinks over edges (tails, heads, capacity), and what the cut nearest to them holds."""
     tails, heads, capacity = graph
-    solver = max_flow.SimpleMaxFlow()
-    end = np.full(len(sinks), nodes)
-    huge = np.full(len(sinks), 4 * _SCALE)
-    solver.add_arcs_with_capacity(
-        np.concatenate([tails, heads, sinks]),
-        np.concatenate([heads, tails, end]),
-        np.concatenate([capacity, capacity, huge]),
-    )
-    solver.solve(0, nodes)
-    side = np.array(solver.get_sink_side_min_cut())
-    return solver.optimal_flow(), side[side < nodes]
+    drain = np.full(len(sinks), nodes)
+    entries = np.concatenate([capacity, capacity, np.full(len(sinks), 4 * _SCALE)]).astype(np.int32)
+    where = np.concatenate([tails, heads, sinks]), np.concatenate([heads, tails, drain])
+    matrix = csr_array((entries, where), shape=(nodes + 1, nodes + 1))
+    result = maximum_flow(matrix, 0, nodes)
+    left = csr_array((matrix - result.flow).T)  # what can still flow, backwards
+    left.eliminate_zeros()
+    side = breadth_first_order(left, nodes, return_predecessors=False)
+    return int(result.flow_value), side[side < nodes]

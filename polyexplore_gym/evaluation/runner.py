@@ -6,9 +6,10 @@ import dataclasses
 import functools
 import importlib.metadata
 import platform
+import signal
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -225,7 +226,8 @@ def _parallel(
         batch_size=1,
         pre_dispatch="2 * n_jobs",
     )
-    results = parallel(delayed(run)(task, make_env) for task in tasks)
+    with _interrupts_held():
+        results = parallel(delayed(run)(task, make_env) for task in tasks)
     try:
         yield from results
     except TerminatedWorkerError as error:
@@ -237,6 +239,19 @@ def _parallel(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # joblib tells of the tasks that a stop leaves behind
             results.close()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold back Ctrl-C. Processes started meanwhile inherit that for good: it is for this process to end them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run_task_elsewhere(task: Task, make_env: MakeEnv, ours: dict[str, str]) -> EpisodeRecord:

@@ -16,7 +16,7 @@ from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.floorplan import FloorPlan, suite
 
-pytest.importorskip("ortools")
+pytest.importorskip("pyvrp")
 pytest.importorskip("highspy")
 
 from baselines import make_policy
