@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from polyexplore_gym.exploration.scan_polygon import contains
-from polyexplore_gym.exploration.segments import bucket, clearance, point_segment_distance
+from polyexplore_gym.exploration.segments import bucket, clearance, norm, point_segment_distance
 
 CORNER, LEAF = 0, 1
 """Kinds of vertices; -1 is none."""
@@ -266,16 +266,16 @@ def _absorb(x, y, form, px, py, shape):
 
     Both must stand beside each other and look the same way from their corners.
     """
-    if math.hypot(px - x, py - y) > _SPACING:
+    if norm(px - x, py - y) > _SPACING:
         return False
     # One that stands nearer to the candidate's own corner would let taut paths scrape it.
-    if math.hypot(px - form[0], py - form[1]) < math.hypot(x - form[0], y - form[1]) - 0.01:
+    if norm(px - form[0], py - form[1]) < norm(x - form[0], y - form[1]) - 0.01:
         return False
     rx = x - form[0]
     ry = y - form[1]
     qx = px - shape[0]
     qy = py - shape[1]
-    if rx * qx + ry * qy <= 0.9 * math.hypot(rx, ry) * math.hypot(qx, qy):
+    if rx * qx + ry * qy <= 0.9 * norm(rx, ry) * norm(qx, qy):
         return False
     for k in (2, 4):
         if form[k] * shape[k] + form[k + 1] * shape[k + 1] < 0.95:
@@ -283,7 +283,7 @@ def _absorb(x, y, form, px, py, shape):
             shape[k] = 0.0
             shape[k + 1] = 0.0
             shape[6] = _FREE
-    if math.hypot(shape[0] - form[0], shape[1] - form[1]) > _APART:
+    if norm(shape[0] - form[0], shape[1] - form[1]) > _APART:
         # It now serves two wall ends.
         shape[2:6] = 0.0
         shape[6] = max(shape[6], _FREE)
@@ -305,12 +305,12 @@ def distinct(candidates, forms, position, shape, kind, n_vertices):
                 continue
             if _absorb(x, y, forms[i], position[v, 0], position[v, 1], shape[v]):
                 keep[i] = False
-                apart = math.hypot(forms[i, 0] - shape[v, 0], forms[i, 1] - shape[v, 1])
+                apart = norm(forms[i, 0] - shape[v, 0], forms[i, 1] - shape[v, 1])
                 break
         for j in range(i):
             if keep[i] and keep[j] and _absorb(x, y, forms[i], candidates[j, 0], candidates[j, 1], forms[j]):
                 keep[i] = False
-                apart = math.hypot(forms[i, 0] - forms[j, 0], forms[i, 1] - forms[j, 1])
+                apart = norm(forms[i, 0] - forms[j, 0], forms[i, 1] - forms[j, 1])
         if apart > _APART:
             # Its neighbours round the corner now turn to a vertex that stands a little elsewhere.
             for j in (i - 1, i + 1):
@@ -327,7 +327,7 @@ def tangent(dx, dy, length, x, y, shape, v):
         return True
     rx = x - shape[v, 0]
     ry = y - shape[v, 1]
-    if abs(dx * rx + dy * ry) > shape[v, 6] * math.hypot(rx, ry):
+    if abs(dx * rx + dy * ry) > shape[v, 6] * norm(rx, ry):
         return False
     side = dy * rx - dx * ry
     c1 = dx * shape[v, 3] - dy * shape[v, 2]

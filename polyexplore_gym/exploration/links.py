@@ -13,7 +13,13 @@ import numpy as np
 from numba import njit
 
 from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL, tangent
-from polyexplore_gym.exploration.segments import crossing_free, point_segment_distance, segment_distance, sweep_free
+from polyexplore_gym.exploration.segments import (
+    crossing_free,
+    norm,
+    point_segment_distance,
+    segment_distance,
+    sweep_free,
+)
 
 _MAX_LEAF_EDGE = 15.0
 _MAX_EDGE = 10.0
@@ -169,7 +175,7 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
     for w in range(walls.shape[0]):
         discs[w, 0] = 0.5 * (walls[w, 0] + walls[w, 2])
         discs[w, 1] = 0.5 * (walls[w, 1] + walls[w, 3])
-        discs[w, 2] = 0.5 * math.hypot(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + need
+        discs[w, 2] = 0.5 * norm(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + need
         x0 = min(x0, walls[w, 0] - need, walls[w, 2] - need)
         x1 = max(x1, walls[w, 0] + need, walls[w, 2] + need)
         y0 = min(y0, walls[w, 1] - need, walls[w, 3] - need)
@@ -203,7 +209,7 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
         bx = position[v, 0]
         by = position[v, 1]
         if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
-            keep[e] = not _hit(ax, ay, bx, by, math.hypot(bx - ax, by - ay), blocked_want[e], walls, discs)
+            keep[e] = not _hit(ax, ay, bx, by, norm(bx - ax, by - ay), blocked_want[e], walls, discs)
     for u in range(n_vertices):
         ax = position[u, 0]
         ay = position[u, 1]
@@ -283,7 +289,7 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             dy = position[v, 1] - uy
             if abs(dx) > _MAX_LEAF_EDGE or abs(dy) > _MAX_LEAF_EDGE or kind[v] < 0 or rank[v] > i or v == u:
                 continue
-            d = math.hypot(dx, dy)
+            d = norm(dx, dy)
             if d > (_MAX_LEAF_EDGE if kind[u] == LEAF or kind[v] == LEAF else _MAX_EDGE):
                 continue
             if d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= TRAIL:

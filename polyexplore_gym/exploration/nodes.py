@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from polyexplore_gym.exploration.corners import REACH
-from polyexplore_gym.exploration.segments import clearance, crossing_free, sweep_free
+from polyexplore_gym.exploration.segments import clearance, crossing_free, norm, sweep_free
 
 _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
 _OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0])
@@ -39,10 +39,10 @@ def point_along(rows, pieces, fraction):
     """Point at a fraction of the length of a chain of pieces (rows in order)."""
     total = 0.0
     for i in rows:
-        total += math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+        total += norm(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
     run = fraction * total
     for i in rows:
-        size = math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+        size = norm(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
         if run <= size and size > 0.0:
             f = run / size
             return pieces[i, 0] + f * (pieces[i, 2] - pieces[i, 0]), pieces[i, 1] + f * (pieces[i, 3] - pieces[i, 1])
@@ -56,7 +56,7 @@ def stands(x, y, mx, my, chain, walls, w_start, w_items, pieces, p_start, p_item
     """Whether the disc may stand at (x, y) and the point (mx, my) of its jump edge is in sight."""
     if clearance(x, y, walls, w_start, w_items, REACH) < need:
         return False
-    if math.hypot(mx - x, my - y) < _SIGHT:
+    if norm(mx - x, my - y) < _SIGHT:
         return True
     return sees(x, y, mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain, chain)
 
@@ -80,7 +80,7 @@ def place(which, node, vertex, middle, normal, length, chain, front, spacing, wa
             y = node[i, 1]
             # Walls that came later may stand too near, or between the node and its jump edge.
             if clearance(x, y, walls, w_start, w_items, REACH) >= need - 0.02 and (
-                math.hypot(middle[i, 0] - x, middle[i, 1] - y) < 2.0 * _ASIDE
+                norm(middle[i, 0] - x, middle[i, 1] - y) < 2.0 * _ASIDE
                 or crossing_free(
                     x, y, middle[i, 0] - _ASIDE * normal[i, 0], middle[i, 1] - _ASIDE * normal[i, 1], walls, w_start,
                     w_items, no_owner, -2, -2, 0.0, _SIGHT,
@@ -168,7 +168,7 @@ def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, known, 
     for v in range(seen.size):
         if not seen[v] or kind[v] < 0:
             continue
-        d = math.hypot(mx - position[v, 0], my - position[v, 1])
+        d = norm(mx - position[v, 0], my - position[v, 1])
         if d >= best:
             continue
         if through_unknown:
@@ -207,7 +207,7 @@ def gains(which, node, vertex, middle, ends, chain, max_range, walls, w_start, w
         for i in range(middle.shape[0]):
             if i == n:
                 continue
-            if math.hypot(middle[i, 0] - x, middle[i, 1] - y) > max_range:
+            if norm(middle[i, 0] - x, middle[i, 1] - y) > max_range:
                 continue
             if not _sees(
                 x, y, middle[i, 0], middle[i, 1], walls, w_start, w_items, no_owner, pieces, p_start, p_items, owner,
