@@ -8,7 +8,7 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping.extract import LEAST_ANGLE_NOISE, LEAST_RANGE_NOISE, ScanLines
 from polyexplore_gym.mapping.grid import empty_grid, grid_put
 from polyexplore_gym.mapping.merge import insert
-from polyexplore_gym.mapping.slots import Lines, Rows, Slots
+from polyexplore_gym.mapping.slots import MEMORY, Lines, Rows, Slots
 
 
 class LineMap:
@@ -203,4 +203,5 @@ def _lines(n: int) -> Lines:
         np.zeros(n, np.bool_),
         np.zeros(n, np.int8),
         np.full(n, -1, np.int64),
+        np.zeros((n, MEMORY), np.int64),
     )

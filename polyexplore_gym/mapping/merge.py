@@ -10,15 +10,18 @@ from numba import njit
 from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
 from polyexplore_gym.mapping.grid import Grid, grid_query
 from polyexplore_gym.mapping.slots import (
+    MEMORY,
     Lines,
     Rows,
     Slots,
+    feed,
     free_line,
     free_row,
     new_row,
     oriented,
     publish,
     store,
+    told_apart,
     unlink,
 )
 
@@ -85,12 +88,16 @@ def candidates(
     grid: Grid,
     gate: float,
     door: float,
+    stamp: int,
+    own: int,
     found: np.ndarray,
     out: np.ndarray,
-) -> tuple[int, float]:
-    """Map lines that pass the merge test with new line i (map frame): the best first. Returns number and its d2.
+) -> tuple[int, bool]:
+    """Map lines that pass the merge test with new line i (map frame): the best first.
 
-    Each row of `out` is line slot, d2, x, y of the middle between the pieces compared.
+    Each row of `out` is line slot, d2, x, y of the middle between the pieces compared. What another line of the
+    scan feeds (in insert `stamp`) is left out, but for `own`. Returns their number, and whether it is clear which
+    one it is: not so if a scan told the best and another one apart.
     """
     ux, uy = -math.sin(alpha), math.cos(alpha)
     count = 0
@@ -101,7 +108,7 @@ def candidates(
         for q in range(box_query(grid, s, door, found)):
             row = found[q]
             j = rows.line[row]
-            if j < 0:
+            if j < 0 or (lines.fed[j, stamp % MEMORY] == stamp and j != own):
                 continue
             r = rows.segments[row]
             if interval_gap(s, r, ux, uy) >= door:
@@ -123,7 +130,10 @@ def candidates(
                     at -= 1
                 out[at, 0], out[at, 1], out[at, 2], out[at, 3] = j, d2, x, y
                 count += 1
-    return count, out[0, 1] if count > 0 else math.inf
+    clear = True
+    for c in range(1, count):
+        clear = clear and not told_apart(lines, int(out[0, 0]), int(out[c, 0]))
+    return count, clear
 
 
 @njit(cache=True)
@@ -296,6 +306,26 @@ def covered(
 
 
 @njit(cache=True)
+def fused_in_scan(
+    i: int, j: int, segments: np.ndarray, of: np.ndarray, rho: np.ndarray, alpha: np.ndarray, covariance: np.ndarray,
+    gate: float,
+) -> bool:  # fmt: skip
+    """Make line i of a scan of lines i and j, in the scan's frame, if they pass the merge test; whether they did."""
+    x, y, pieces = 0.0, 0.0, 0
+    for k in range(of.size):
+        if of[k] == i or of[k] == j:
+            x += 0.5 * (segments[k, 0] + segments[k, 2])
+            y += 0.5 * (segments[k, 1] + segments[k, 3])
+            pieces += 1
+    x, y = x / pieces, y / pieces
+    if distance2(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y) >= gate:
+        return False
+    rho[i], alpha[i], covariance[i] = fuse(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y)
+    of[of == j] = i
+    return True
+
+
+@njit(cache=True)
 def insert(
     rho: np.ndarray,
     alpha: np.ndarray,
@@ -343,36 +373,33 @@ def insert(
             v = var_range * var_angle * d2 / v_normal + var_xy + pose_covariance[2, 2] * d2
             placed[k, 4 + e] = max(v, LEAST_END**2)
 
-    # new lines that meet the same map line share this scan's pose error: merge them in the scan's frame first
+    # Lines of one scan share its pose error: those that meet one map line merge in the scan's own frame; of those that
+    # the scan tells apart the nearest has it, the others take the next that they pass with.
     best = np.full(n, -1 if grouping else 0, np.int64)
     score = np.full(n, math.inf)
+    for first in range(n if grouping else 0):
+        i = first
+        while i >= 0:
+            r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
+            count, clear = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, -1, found, match)
+            looking, i = i, -1
+            for q in range(count if clear else 0):
+                j, d2 = int(match[q, 0]), match[q, 1]
+                holder = -1
+                for k in range(n):
+                    if best[k] == j:
+                        holder = k
+                if holder >= 0 and fused_in_scan(holder, looking, segments, of, rho, alpha, covariance, gate):
+                    best[looking] = -2
+                    break
+                if holder < 0 or d2 < score[holder]:
+                    best[looking], score[looking] = j, d2
+                    if holder >= 0:
+                        best[holder], i = -1, holder
+                    break
     for i in range(n if grouping else 0):
-        r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
-        count, d2 = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, found, match)
-        if count == 0:
-            continue
-        best[i], score[i] = int(match[0, 0]), d2
-        for j in range(i):
-            if best[j] != best[i]:
-                continue
-            x, y, pieces = 0.0, 0.0, 0
-            for k in range(of.size):
-                if of[k] == i or of[k] == j:
-                    x += 0.5 * (segments[k, 0] + segments[k, 2])
-                    y += 0.5 * (segments[k, 1] + segments[k, 3])
-                    pieces += 1
-            x, y = x / pieces, y / pieces
-            if distance2(rho[j], alpha[j], covariance[j], rho[i], alpha[i], covariance[i], x, y) < gate:
-                rho[j], alpha[j], covariance[j] = fuse(
-                    rho[j], alpha[j], covariance[j], rho[i], alpha[i], covariance[i], x, y
-                )
-                of[of == i] = j
-                best[i] = -2
-            elif score[i] < score[j]:
-                best[j] = -1
-            else:
-                best[i] = -1
-            break
+        if best[i] >= 0:
+            feed(lines, best[i], stamp)
 
     fresh = np.empty((segments.shape[0], 6))
     for i in range(n):
@@ -381,7 +408,9 @@ def insert(
         r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
         target, count = -1, 0
         if best[i] >= 0:
-            count, _ = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, found, match)
+            count, _ = candidates(
+                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, best[i], found, match
+            )
         for q in range(count):
             j = int(match[q, 0])
             rho_j, alpha_j, p_j = oriented(lines, j)
@@ -389,7 +418,8 @@ def insert(
             if target < 0:
                 r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
                 target = j
-            elif distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
+            elif not told_apart(lines, target, j) and distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
+                lines.fed[target] = np.maximum(lines.fed[target], lines.fed[j])
                 r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
                 free_line(lines, slots, j)
                 # its rows become fresh pieces of the target below
@@ -420,6 +450,12 @@ def insert(
             target = slots.lines[slots.counts[1]]
             lines.alive[target] = True
             lines.first[target] = -1
+            lines.fed[target] = 0
+            if grouping:
+                feed(lines, target, stamp)
+                for k in range(i + 1, n):  # a slot freed a moment ago
+                    if best[k] == target:
+                        best[k] = -1
         store(lines, target, r0, a0, p0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
         clear_covered(target, rows, lines, grid, slots, sigma_range, found)

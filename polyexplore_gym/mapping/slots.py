@@ -11,6 +11,7 @@ from numba import njit
 from polyexplore_gym.mapping.fit import wrap
 from polyexplore_gym.mapping.grid import Grid, grid_put, grid_remove
 
+MEMORY = 16  # inserts that a line remembers
 STILL = 2e-3  # m; a row whose ends move less counts as untouched
 
 
@@ -46,6 +47,8 @@ class Lines(NamedTuple):
     side: np.ndarray
     first: np.ndarray
     """First row on the line, -1 for none."""
+    fed: np.ndarray
+    """(N, MEMORY) numbers of inserts with a line of their scan for this one, each in the column number % MEMORY."""
 
 
 class Slots(NamedTuple):
@@ -82,6 +85,17 @@ def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray) -> None
     else:
         lines.rho[i], lines.alpha[i], lines.side[i] = rho, wrap(alpha), 1
         lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = p[0, 1]
+
+
+@njit(cache=True)
+def feed(lines: Lines, line: int, stamp: int) -> None:
+    lines.fed[line, stamp % MEMORY] = stamp
+
+
+@njit(cache=True)
+def told_apart(lines: Lines, i: int, j: int) -> bool:
+    """Whether a scan had a line for each of the two, as far as they remember."""
+    return bool(np.any((lines.fed[i] == lines.fed[j]) & (lines.fed[i] > 0)))
 
 
 @njit(cache=True)
