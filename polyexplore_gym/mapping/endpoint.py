@@ -1,9 +1,9 @@
 """First guess of a scan's lines: iterative end-point fit with noise-aware splitting.
 
 Runs of neighbouring returns are split where a return leaves the chord between the run's ends by
-more than the noise explains; pieces are then joined again where one line explains both (likelihood
-ratio), and the border between neighbours is moved to where both fit best. Each return ends with
-the label of its piece, or -1.
+more than the noise explains, and where two lines fit much better than one. Pieces are then joined
+again where one line explains both (likelihood ratio), and the border between neighbours is moved to
+where both fit best. Each return ends with the label of its piece, or -1.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from polyexplore_gym.mapping.fit import distance2, fit, normal_variance
 SPLIT_GATE = 3.5**2  # squared deviation from the chord over its variance
 JOIN_GATE = 20.0  # chi-square of one line instead of two: 2 degrees of freedom, and the choice of the place
 JOIN_THREE_GATE = 34.0  # the same for one line instead of three
+EXCESS = 4.0  # a piece whose chi-square is so many standard deviations too large is no straight wall
 ROUGH = 0.03  # accuracy of the fits that only choose, in standard deviations
 BREAK_INCIDENCE = math.radians(86.0)  # neighbouring returns on a wall seen more obliquely start a new run
 
@@ -95,6 +96,71 @@ def split(x: np.ndarray, y: np.ndarray, run: np.ndarray, var_range: float, var_a
             top += 2
         start = stop + 1
     return pieces[:count]
+
+
+@njit(cache=True)
+def border(
+    x: np.ndarray, y: np.ndarray, lo: int, hi: int, rho: float, alpha: float, var_range: float, var_angle: float
+) -> tuple[int, float]:
+    """Where two lines fit returns lo..hi best: the last return of the first one, and the chi-square of both.
+
+    Each has 3 returns at least. Both are straight lines of deviations over positions along the line (rho, alpha),
+    with its weights.
+    """
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    n = hi - lo + 1
+    sums = np.zeros((n + 1, 6))
+    for q in range(n):
+        k = lo + q
+        e, t = x[k] * ca + y[k] * sa - rho, y[k] * ca - x[k] * sa
+        w = 1.0 / normal_variance(x[k], y[k], ca, sa, var_range, var_angle)
+        s = sums[q + 1]
+        s[0], s[1], s[2], s[3], s[4], s[5] = w, w * t, w * t * t, w * e, w * e * t, w * e * e
+        s += sums[q]
+    best, least = -1, math.inf
+    for q in range(3, n - 2):
+        chi2 = misfit(sums[q]) + misfit(sums[n] - sums[q])
+        if chi2 < least:
+            best, least = lo + q - 1, chi2
+    return best, least
+
+
+@njit(cache=True)
+def misfit(s: np.ndarray) -> float:
+    """Chi-square of the best straight line, from the sums of w, wt, wtt, we, wet, wee."""
+    tt, et = s[2] - s[1] * s[1] / s[0], s[4] - s[1] * s[3] / s[0]
+    return s[5] - s[3] * s[3] / s[0] - (et * et / tt if tt > 0.0 else 0.0)
+
+
+@njit(cache=True)
+def divide(x: np.ndarray, y: np.ndarray, pieces: np.ndarray, var_range: float, var_angle: float) -> np.ndarray:
+    """Part the pieces that no one line fits, though no return leaves the chord: steps of a few sigma."""
+    order = np.arange(x.size)
+    out, stack = np.empty((x.size, 2), np.int64), np.empty((x.size + 1, 2), np.int64)
+    line = np.empty(8)
+    count = 0
+    for p in range(pieces.shape[0]):
+        stack[0] = pieces[p]
+        top = 1
+        while top > 0:
+            top -= 1
+            lo, hi = stack[top, 0], stack[top, 1]
+            dof = hi - lo - 1
+            k = -1
+            if dof >= 4:
+                fit_piece(x, y, order, lo, hi, var_range, var_angle, line)
+                if line[7] > dof + EXCESS * math.sqrt(2.0 * dof):
+                    at, chi2 = border(x, y, lo, hi, line[2], line[3], var_range, var_angle)
+                    if line[7] - chi2 > JOIN_GATE:
+                        k = at
+            if k < 0:
+                out[count, 0], out[count, 1] = lo, hi
+                count += 1
+            else:
+                stack[top, 0], stack[top, 1] = k + 1, hi
+                stack[top + 1, 0], stack[top + 1, 1] = lo, k
+                top += 2
+    return out[:count]
 
 
 @njit(cache=True)
@@ -211,6 +277,7 @@ def endpoint_labels(
     """(m,) label of the piece each return lies on (-1 none) and the number of pieces."""
     run = runs(x, y, beam, resolution, var_range)
     pieces = split(x, y, run, var_range, var_angle)
+    pieces = divide(x, y, pieces, var_range, var_angle)
     pieces, rho, alpha = join(x, y, run, pieces, var_range, var_angle)
     sharpen(x, y, run, pieces, rho, alpha, var_range, var_angle)
     label = np.full(x.size, -1, np.int64)

@@ -15,7 +15,7 @@ from numba import njit
 
 from polyexplore_gym.mapping.fit import fit, normal_variance, wrap
 
-RASTER = 0.02  # m a pixel
+RASTER = 0.025  # m a pixel
 ANGLE_STEP = math.radians(1.0)
 VOTES = 5
 LEAST_LENGTH = 0.25  # m, of a line on the raster

@@ -14,6 +14,7 @@ from polyexplore_gym.mapping.slots import (
     Lines,
     Rows,
     Slots,
+    facing,
     feed,
     free_line,
     free_row,
@@ -34,11 +35,13 @@ LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end alon
 
 
 @njit(cache=True)
-def segment_distance(px: float, py: float, s: np.ndarray) -> float:
+def within(px: float, py: float, s: np.ndarray, reach: float) -> bool:
+    """Whether a point lies so near to segment s, or nearer."""
     dx, dy = s[2] - s[0], s[3] - s[1]
     q = dx * dx + dy * dy
     t = 0.0 if q == 0.0 else min(max(((px - s[0]) * dx + (py - s[1]) * dy) / q, 0.0), 1.0)
-    return math.hypot(px - s[0] - t * dx, py - s[1] - t * dy)
+    ex, ey = px - s[0] - t * dx, py - s[1] - t * dy
+    return ex * ex + ey * ey <= reach * reach
 
 
 @njit(cache=True)
@@ -111,7 +114,7 @@ def candidates(
             if j < 0 or (lines.fed[j, stamp % MEMORY] == stamp and j != own):
                 continue
             r = rows.segments[row]
-            if interval_gap(s, r, ux, uy) >= door:
+            if abs(wrap(alpha - facing(lines, j))) > MAX_TURN or interval_gap(s, r, ux, uy) >= door:
                 continue
             known = False
             for c in range(count):
@@ -119,8 +122,6 @@ def candidates(
             if known or count == out.shape[0]:
                 continue
             rho_j, alpha_j, p_j = oriented(lines, j)
-            if abs(wrap(alpha - alpha_j)) > MAX_TURN:
-                continue
             x, y = 0.25 * (s[0] + s[2] + r[0] + r[2]), 0.25 * (s[1] + s[3] + r[1] + r[3])
             d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
             if d2 < gate:
@@ -240,7 +241,7 @@ def clear_covered(
     line: int, rows: Rows, lines: Lines, grid: Grid, slots: Slots, sigma_range: float, found: np.ndarray
 ) -> None:
     """Remove fragments, and shorter segments that face the same way, that the line's changed rows cover."""
-    _, alpha, _ = oriented(lines, line)
+    alpha = facing(lines, line)
     row = lines.first[line]
     while row >= 0:
         w = rows.segments[row]
@@ -253,11 +254,10 @@ def clear_covered(
             if rows.line[f] >= 0:
                 if rows.line[f] == line or math.hypot(g[2] - g[0], g[3] - g[1]) > length:
                     continue
-                _, other, _ = oriented(lines, rows.line[f])
-                if abs(wrap(alpha - other)) > STANDS_FOR:
+                if abs(wrap(alpha - facing(lines, rows.line[f]))) > STANDS_FOR:
                     continue
                 tolerance = COVER + sigma_range + 3.0 * math.hypot(rows.sigma[f], rows.sigma[row])
-            if segment_distance(g[0], g[1], w) <= tolerance and segment_distance(g[2], g[3], w) <= tolerance:
+            if within(g[0], g[1], w, tolerance) and within(g[2], g[3], w, tolerance):
                 if rows.line[f] >= 0:
                     unlink(rows, lines, slots, f)
                 free_row(rows, grid, slots, f)
@@ -276,7 +276,17 @@ def covered(
     With any_side False only rows that face the same way (normal direction side_alpha) count.
     """
     tolerance = COVER + 3.0 * sigma
-    n = box_query(grid, s, tolerance + 0.5, found)
+    n = 0
+    for q in range(box_query(grid, s, tolerance + 0.5, found)):
+        row = found[q]
+        j = rows.line[row]
+        if any_side:
+            counts = j >= 0 or rows.touched[row] != stamp
+        else:
+            counts = j >= 0 and abs(wrap(facing(lines, j) - side_alpha)) <= STANDS_FOR
+        if counts:
+            found[n] = row
+            n += 1
     length = math.hypot(s[2] - s[0], s[3] - s[1])
     steps = max(1, math.ceil(length / 0.05))
     first, last = 2.0, -1.0
@@ -286,16 +296,8 @@ def covered(
         hit = False
         for q in range(n):
             row = found[q]
-            j = rows.line[row]
-            if j < 0:
-                if not any_side or rows.touched[row] == stamp:
-                    continue
-            elif not any_side:
-                _, alpha, _ = oriented(lines, j)
-                if abs(wrap(alpha - side_alpha)) > STANDS_FOR:
-                    continue
             reach = tolerance if any_side else COVER + sigma_range + 3.0 * math.hypot(sigma, rows.sigma[row])
-            if segment_distance(px, py, rows.segments[row]) <= reach:
+            if within(px, py, rows.segments[row], reach):
                 hit = True
                 break
         if not hit:

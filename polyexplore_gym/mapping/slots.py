@@ -65,6 +65,12 @@ class Slots(NamedTuple):
 
 
 @njit(cache=True)
+def facing(lines: Lines, i: int) -> float:
+    """Direction of the line's normal that points away from where it was seen, rad."""
+    return lines.alpha[i] if lines.side[i] > 0 else wrap(lines.alpha[i] + math.pi)
+
+
+@njit(cache=True)
 def oriented(lines: Lines, i: int) -> tuple[float, float, np.ndarray]:
     """The line with its normal pointing away from where it was seen (rho may be negative)."""
     p = lines.covariance[i]
