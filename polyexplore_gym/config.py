@@ -107,24 +107,32 @@ class DriveConfig:
 class PoseConfig:
     """What the robot knows of its own pose."""
 
-    mode: Literal["exact", "gaussian", "odometry"] = "exact"
-    """`exact`; `gaussian`: an external localiser with an error per measurement; `odometry`: drift along the path."""
+    mode: Literal["exact", "gaussian", "odometry", "slam"] = "exact"
+    """`exact`; `gaussian`: an external localiser with an error per measurement; `odometry`: drift along the path;
+    `slam`: the same drift, corrected before every measurement by the walls known already."""
     sigma_xy: float = 0.02
     """gaussian: standard deviation of x and of y, m."""
     sigma_heading: float = math.radians(0.5)
     """gaussian: standard deviation of the heading, rad."""
     drift_distance: float = 0.02
-    """odometry: standard deviation of the position drift per metre driven, m at 1 m (grows with the root)."""
+    """odometry, slam: standard deviation of the position drift per metre driven, m at 1 m (grows with the root)."""
     drift_heading: float = math.radians(1.0)
-    """odometry: standard deviation of the heading drift per metre driven, rad at 1 m (grows with the root)."""
+    """odometry, slam: standard deviation of the heading drift per metre driven, rad at 1 m (grows with the root)."""
     drift_turn: float = 0.01
-    """odometry: standard deviation of the heading drift per radian turned, rad at 1 rad (grows with the root)."""
+    """odometry, slam: standard deviation of the heading drift per radian turned, rad at 1 rad (grows with the root)."""
+
+    correct_every: float = 0.5
+    """slam: also correct the pose by a scan every so many metres of the way, or radians turned; these scans go into no
+    map. 0: only by the measurements themselves."""
 
     def __post_init__(self) -> None:
         _require_finite(self)
-        _require(self.mode in ("exact", "gaussian", "odometry"), self, "mode", "must be exact, gaussian or odometry")
+        modes = ("exact", "gaussian", "odometry", "slam")
+        _require(self.mode in modes, self, "mode", "must be exact, gaussian, odometry or slam")
         for name in ("sigma_xy", "sigma_heading", "drift_distance", "drift_heading", "drift_turn"):
             _require(getattr(self, name) >= 0, self, name, "must not be negative")
+        ok = self.correct_every == 0 or self.correct_every >= 0.1
+        _require(ok, self, "correct_every", "must be 0 or at least 0.1")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

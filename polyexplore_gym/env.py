@@ -17,7 +17,7 @@ from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, Inval
 from polyexplore_gym.exploration import ExplorationMap
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
 from polyexplore_gym.floorplan import suite as suite_named
-from polyexplore_gym.mapping import LineMap, extract_lines
+from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.coverage import Coverage, grid_points
@@ -121,6 +121,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
         self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
         self._lines = LineMap(c.mapping, c.sensor)
+        self._localizer = Localizer() if c.pose.mode == "slam" else None
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
         self._distance = self._sim_time = 0.0
@@ -256,10 +257,10 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         way, stops = _with_stops(result.trajectory, self.config.exploration.scan_every)
         done = 0
         for stop in stops:
-            self._pose_model.moved(way[done : stop + 1])
+            self._follow(way[done : stop + 1])
             self._measure(way[stop], None, arrived=True)
             done = stop
-        self._pose_model.moved(way[done:])
+        self._follow(way[done:])
         self._trajectory.append(way)
         self._distance += result.distance
         self._sim_time += result.duration
@@ -267,15 +268,38 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._felt = result.contact
         return result.arrived
 
-    def _measure(self, pose: np.ndarray, target: int | None, *, arrived: bool) -> None:
-        """Scan from a true pose and take the scan into both maps."""
+    def _follow(self, way: np.ndarray) -> None:
+        """Advance the estimated pose along true poses (m, 3); in the mode slam it is corrected on the way."""
+        done = 0
+        if self._localizer is not None:
+            way, stops = _with_stops(way, self.config.pose.correct_every, turns=True)
+            for stop in stops:
+                self._pose_model.moved(way[done : stop + 1])
+                self._scan_lines(way[stop])
+                done = stop
+        self._pose_model.moved(way[done:])
+
+    def _scan_lines(self, pose: np.ndarray) -> tuple[np.ndarray, ScanLines, Correction]:
+        """Ranges and lines of a scan from a true pose, and what they say of the estimated one."""
         assert self._world is not None
         laser = self._world.laser
         ranges = laser.measure(self._world.segments, pose, self._laser_rng)
+        found = extract_lines(laser.angles, ranges, self.config.sensor, self.config.mapping)
         estimate, covariance = self._pose_model.measured(pose)
-        scan = Scan(laser.angles, ranges, estimate, covariance, self.config.sensor.full_circle)
-        found = extract_lines(scan.angles, scan.ranges, self.config.sensor, self.config.mapping)
-        touched = self._lines.insert(found, estimate, covariance)
+        if self._localizer is None:
+            return ranges, found, Correction.none(estimate, covariance)
+        fix = self._localizer.correct(found, self._lines, estimate, covariance)
+        self._pose_model.correct(fix.pose, fix.covariance)
+        return ranges, found, fix
+
+    def _measure(self, pose: np.ndarray, target: int | None, *, arrived: bool) -> None:
+        """Scan from a true pose and take the scan into both maps."""
+        assert self._world is not None
+        ranges, found, fix = self._scan_lines(pose)
+        scan = Scan(self._world.laser.angles, ranges, fix.pose, fix.covariance, self.config.sensor.full_circle)
+        touched = self._lines.insert(found, fix.pose, fix.relative)
+        if self._localizer is not None:
+            self._localizer.learn(self._lines)
         self._exploration.insert(
             scan,
             self._lines.segments,
@@ -393,9 +417,15 @@ def _suite(name: str) -> Suite:
     return suite_named(name)
 
 
-def _with_stops(way: np.ndarray, every: float) -> tuple[np.ndarray, list[int]]:
-    """A trajectory (m, 3) with a pose at every so many metres put in, and the rows of those; none near the end."""
-    driven = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way[:, :2], axis=0).T))))
+def _with_stops(way: np.ndarray, every: float, *, turns: bool = False) -> tuple[np.ndarray, list[int]]:
+    """A trajectory (m, 3) with a pose at every so many metres put in, and the rows of those; none near the end.
+
+    With `turns` a radian turned counts as a metre.
+    """
+    run = np.hypot(*np.diff(way[:, :2], axis=0).T)
+    if turns:
+        run += np.abs(np.remainder(np.diff(way[:, 2]) + math.pi, 2.0 * math.pi) - math.pi)
+    driven = np.concatenate(([0.0], np.cumsum(run)))
     marks = np.arange(every, driven[-1] - 0.5 * every, every) if every > 0 else np.zeros(0)
     if not len(marks):
         return way, []

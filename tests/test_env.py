@@ -26,6 +26,7 @@ from polyexplore_gym.config import EnvConfig, to_mapping
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
 from polyexplore_gym.floorplan import FloorPlan, generate, save_plan
+from polyexplore_gym.floorplan import suite as named_suite
 
 KINEMATIC = {"drive": {"mode": "kinematic"}}
 SMALL = {**KINEMATIC, "observation": {"max_nodes": 16, "max_lines": 64}, "max_decisions": 25}
@@ -591,6 +592,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "physics": {},
     "physics in_front odometry": {"exploration": {"placement": "in_front"}, "pose": {"mode": "odometry"}},
     "gaussian": {**KINEMATIC, "pose": {"mode": "gaussian"}},
+    "slam": {**KINEMATIC, "pose": {"mode": "slam"}},
     "odometry relative": {**KINEMATIC, "pose": {"mode": "odometry"}, "observation": {"relative": True}},
     "relative": {**KINEMATIC, "observation": {"relative": True}},
     "scans on the way": {**KINEMATIC, "exploration": {"scan_every": 0.7}},
@@ -852,3 +854,25 @@ def test_snapshots_do_not_change_later():
         env.step(action)
     assert pickle.dumps(scene) == kept
     assert scene.node_mask[action]
+
+
+def test_slam_sees_what_an_exact_pose_sees_and_odometry_does_not():
+    """Drift of 2 % of the distance and 1 degree a metre, the defaults; the same seeds for all three."""
+    plans = [named_suite("home-validation").plan(i) for i in (5, 6)]
+    coverage, error = {}, {}
+    for mode in ("exact", "odometry", "slam"):
+        coverage[mode], error[mode] = [], []
+        for i, plan in enumerate(plans, 5):
+            env = PolyExploreEnv(plan, config={**KINEMATIC, "pose": {"mode": mode}, "max_decisions": 100})
+            observation, info = env.reset(seed=i)
+            done = truncated = False
+            while not (done or truncated):
+                mask = info["action_mask"].astype(bool)
+                action = int(np.argmin(np.where(mask, observation["node_path_length"], np.inf)))
+                observation, _, done, truncated, info = env.step(action)
+            assert done
+            coverage[mode].append(info["coverage"])
+            error[mode].append(np.hypot(*(observation["pose"][:2] - env.true_pose[:2])))
+    assert sum(coverage["odometry"]) < sum(coverage["exact"]) - 0.2
+    assert min(coverage["slam"]) > min(coverage["exact"]) - 0.02
+    assert max(error["slam"]) < 0.15 < max(error["odometry"])

@@ -3,14 +3,17 @@
 from polyexplore_gym.mapping.export import MAP_SUFFIXES, save_map
 from polyexplore_gym.mapping.extract import ScanLines, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
+from polyexplore_gym.mapping.localize import Correction, Localizer
 from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
 from polyexplore_gym.mapping.logs import LaserLog, read_log
 from polyexplore_gym.mapping.polylines import ScanPolylines, extract_polylines
 
 __all__ = [
     "MAP_SUFFIXES",
+    "Correction",
     "LaserLog",
     "LineMap",
+    "Localizer",
     "LogMap",
     "ScanLines",
     "ScanPolylines",

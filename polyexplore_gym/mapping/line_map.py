@@ -6,7 +6,7 @@ import numpy as np
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping.extract import LEAST_ANGLE_NOISE, LEAST_RANGE_NOISE, ScanLines
-from polyexplore_gym.mapping.grid import empty_grid, grid_put
+from polyexplore_gym.mapping.grid import Grid, empty_grid, grid_put
 from polyexplore_gym.mapping.merge import insert
 from polyexplore_gym.mapping.slots import MEMORY, Lines, Rows, Slots
 
@@ -137,6 +137,11 @@ class LineMap:
         """(N,) like `side`, by line."""
         return self._lines.side[: self._line_count]
 
+    @property
+    def tables(self) -> tuple[Rows, Lines, Grid, np.ndarray]:
+        """Rows, lines, the spatial index of the rows, and scratch for its answers: for kernels of this package."""
+        return self._rows, self._lines, self._grid, self._slots.found
+
     def _reserve(self, rows: int, lines: int) -> None:
         """Make room for so many more rows and lines."""
         old_rows, old_lines = self._rows.alive.size, self._lines.alive.size
@@ -204,4 +209,5 @@ def _lines(n: int) -> Lines:
         np.zeros(n, np.int8),
         np.full(n, -1, np.int64),
         np.zeros((n, MEMORY), np.int64),
+        np.zeros(n, np.int64),
     )

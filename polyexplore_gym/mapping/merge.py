@@ -458,6 +458,7 @@ def insert(
                 for k in range(i + 1, n):  # a slot freed a moment ago
                     if best[k] == target:
                         best[k] = -1
+            lines.born[target] = stamp
         store(lines, target, r0, a0, p0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
         clear_covered(target, rows, lines, grid, slots, sigma_range, found)

@@ -49,6 +49,8 @@ class Lines(NamedTuple):
     """First row on the line, -1 for none."""
     fed: np.ndarray
     """(N, MEMORY) numbers of inserts with a line of their scan for this one, each in the column number % MEMORY."""
+    born: np.ndarray
+    """Number of the insert that put the line there."""
 
 
 class Slots(NamedTuple):

@@ -83,7 +83,7 @@ class PoseModel:
     The map frame is that of the true start pose, so the estimate begins exact. Modes (`PoseConfig.mode`):
     `exact`; `gaussian`: every measurement has an independent error N(0, diag(sigma_xy^2, sigma_xy^2,
     sigma_heading^2)), between measurements the last error is carried along rigidly; `odometry`: the true
-    motion, perturbed, is summed up, and the error never shrinks.
+    motion, perturbed, is summed up, and the error never shrinks; `slam`: the same, but for `correct`.
     """
 
     def __init__(self, config: PoseConfig, pose: np.ndarray, rng: np.random.Generator) -> None:
@@ -114,7 +114,7 @@ class PoseModel:
             raise InvalidMotionError(f"trajectory of shape {trajectory.shape}: expected finite (m, 3)")
         if len(trajectory) == 0:
             return
-        if self.config.mode == "odometry":
+        if self.config.mode in ("odometry", "slam"):
             pieces = _pieces(trajectory)
             noise = self._rng.standard_normal((int(pieces.sum()), 3))
             c = self.config
@@ -144,6 +144,11 @@ class PoseModel:
             self._covariance = np.diag(sigma**2)
         self._true = true_pose
         return self.estimate, self.covariance
+
+    def correct(self, estimate: np.ndarray, covariance: np.ndarray) -> None:
+        """Take over an estimate (3,) and its covariance (3, 3) that a filter made of the last measurement."""
+        self._estimate = _checked_pose(estimate)
+        self._covariance = np.array(covariance, dtype=np.float64)
 
     def to_true(self, points: np.ndarray) -> np.ndarray:
         """Points (k, 2) or poses (k, 3) of the estimated frame in the true frame, by the current error.

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from polyexplore_gym.config import PoseConfig
-from polyexplore_gym.errors import InvalidMotionError
+from polyexplore_gym.errors import InvalidConfigError, InvalidMotionError
 from polyexplore_gym.sim.pose import PoseModel, wrap
 
 DRIVE = np.array([[0, 0, 0.0], [2, 0, 0.0], [2, 0, 1.5], [2.1, 1.5, 1.5], [2.1, 1.5, -2.5], [1.0, 0.7, -2.5]])
@@ -98,7 +98,7 @@ def test_odometry_without_noise_and_in_parts_is_the_truth() -> None:
         np.testing.assert_allclose(error(model.estimate, b), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("mode", ["exact", "gaussian", "odometry"])
+@pytest.mark.parametrize("mode", ["exact", "gaussian", "odometry", "slam"])
 def test_paths_are_mapped_by_the_current_error(mode: str) -> None:
     config = PoseConfig(mode=mode, sigma_heading=0.3, sigma_xy=0.2, drift_heading=0.3)  # type: ignore[arg-type]
     model = PoseModel(config, DRIVE[0], np.random.default_rng(3))
@@ -121,6 +121,21 @@ def test_gaussian_error_is_carried_along_rigidly() -> None:
     model.moved(DRIVE)
     np.testing.assert_allclose(model.estimate, expected, atol=1e-12)
     np.testing.assert_allclose(model.to_true(model.estimate[None])[0], DRIVE[-1], atol=1e-12)
+
+
+def test_slam_drifts_as_odometry_until_it_is_corrected() -> None:
+    models = [PoseModel(PoseConfig(mode=mode), DRIVE[0], np.random.default_rng(6)) for mode in ("odometry", "slam")]
+    for model in models:
+        model.moved(DRIVE)
+        model.measured(DRIVE[-1])
+    np.testing.assert_array_equal(models[0].estimate, models[1].estimate)
+    np.testing.assert_array_equal(models[0].covariance, models[1].covariance)
+    models[1].correct(np.array([1.0, 0.8, 4.0]), np.eye(3))
+    np.testing.assert_allclose(models[1].estimate, [1.0, 0.8, 4.0 - 2 * math.pi])
+    np.testing.assert_array_equal(models[1].covariance, np.eye(3))
+    np.testing.assert_allclose(models[1].to_true(models[1].estimate[None])[0], DRIVE[-1], atol=1e-12)
+    with pytest.raises(InvalidConfigError, match="correct_every"):
+        PoseConfig(correct_every=0.05)
 
 
 def test_wrap_and_bad_input() -> None:
