@@ -1,7 +1,8 @@
 """Distance fields: shortest ways from a source to all vertices, and their repair where the graph has changed.
 
-Only what a change can have made longer or shorter is searched again (Ramalingam and Reps 1996). The queue sorts by
-buckets of distance: a vertex may leave its bucket too early, and then comes back to it.
+Only what a change can have made longer or shorter is searched again (Ramalingam and Reps 1996). A field is right as
+far as its reach; beyond it are upper bounds. The queue sorts by buckets of distance: a vertex may leave its bucket too
+early, and then comes back to it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from polyexplore_gym.exploration.corners import LEAF
 _BUCKETS = 2048
 _PER_METRE = 4.0
 """Buckets a metre; what is farther than all buckets shares the last."""
+_SPARE = 2.0
+"""A field that must grow grows by this much more, m."""
 
 
 @njit(cache=True, inline="always")
@@ -46,7 +49,7 @@ def _leave(v, head, after, before, inside):
 
 
 @njit(cache=True)
-def _settle(dist, parent, source, low, high, head, after, before, inside, links, kind):
+def _settle(dist, parent, source, reach, low, high, head, after, before, inside, links, kind):
     """Empty the queue, whose buckets from `low` to `high` hold vertices; leaves but the source are not gone through."""
     first, degree, _, target, cost, _ = links
     b = low
@@ -64,30 +67,64 @@ def _settle(dist, parent, source, low, high, head, after, before, inside, links,
             if d + cost[h] < dist[w]:
                 dist[w] = d + cost[h]
                 parent[w] = v
-                if kind[w] != LEAF:
+                if kind[w] != LEAF and dist[w] <= reach:
                     high = max(high, _enter(w, dist[w], head, after, before, inside))
 
 
 @njit(cache=True)
-def search(rows, sources, dist, parent, links, kind):
-    """Fill the fields in some rows of dist, parent (k, v): shortest distances and the parents on the way back."""
+def grow(row, source, to, dist, parent, reach, links, kind):
+    """Let the field in a row of dist, parent (k, v) and reach (k,) reach as far as `to`.
+
+    A new one has the reach -1 and is infinite but at its source.
+    """
     head = np.full(_BUCKETS, -1, np.int32)
     after = np.empty(dist.shape[1], np.int32)
     before = np.empty(dist.shape[1], np.int32)
     inside = np.full(dist.shape[1], -1, np.int32)
-    for i in range(rows.size):
-        d = dist[rows[i]]
-        p = parent[rows[i]]
-        d[:] = math.inf
-        p[:] = -1
-        d[sources[i]] = 0.0
-        _enter(sources[i], 0.0, head, after, before, inside)
-        _settle(d, p, sources[i], 0, 0, head, after, before, inside, links, kind)
+    d = dist[row]
+    low = _BUCKETS
+    high = -1
+    for v in range(d.size):
+        if reach[row] < d[v] <= to and d[v] < math.inf and (kind[v] != LEAF or v == source):
+            b = _enter(v, d[v], head, after, before, inside)
+            low = min(low, b)
+            high = max(high, b)
+    reach[row] = to
+    _settle(d, parent[row], source, to, low, high, head, after, before, inside, links, kind)
 
 
 @njit(cache=True)
-def repair(dist, parent, sources, cut, added, length, links, kind):
-    """Repair the fields dist, parent (k, v) of `sources` (k,) (-1: none) after edges were cut and added (e, 2)."""
+def between(rows, sources, guess, dist, parent, reach, links, kind):
+    """Lengths (n, n) of the shortest ways between sources (n,) with fields in `rows`, which grow where they must.
+
+    One field of a pair has to reach the other source. `guess` (n,), a length from anywhere to each, says how far.
+    """
+    n = rows.size
+    out = np.zeros((n, n))
+    # What nothing may lead to first: its surroundings are small. Then what reaches far.
+    order = np.argsort(np.where(np.isinf(guess), -math.inf, -reach[rows]), kind="mergesort")
+    for a in range(n):
+        i = order[a]
+        for attempt in range(3):
+            to = -1.0
+            for b in range(a + 1, n):
+                j = order[b]
+                length = min(dist[rows[i], sources[j]], dist[rows[j], sources[i]])
+                if length > max(reach[rows[i]], reach[rows[j]]):
+                    to = max(to, min(length, guess[i] + guess[j]) + _SPARE)
+                out[i, j] = out[j, i] = length
+            if to < 0.0:
+                break
+            if attempt > 0 or to <= reach[rows[i]]:
+                to = math.inf
+            grow(rows[i], sources[i], to, dist, parent, reach, links, kind)
+    return out
+
+
+@njit(cache=True)
+def repair(dist, parent, reach, sources, cut, added, length, links, kind):
+    """Repair the fields dist, parent (k, v), reach (k,) of `sources` (k,) (-1: none) after edges (e, 2) were cut and
+    added."""
     affected = np.empty(dist.shape[1], np.int64)
     head = np.full(_BUCKETS, -1, np.int32)
     after = np.empty(dist.shape[1], np.int32)
@@ -128,7 +165,7 @@ def repair(dist, parent, sources, cut, added, length, links, kind):
                 if (kind[w] != LEAF or w == s) and d[w] + links.cost[h] < d[v]:
                     d[v] = d[w] + links.cost[h]
                     p[v] = w
-            if d[v] < math.inf and kind[v] != LEAF:
+            if d[v] < math.inf and d[v] <= reach[k] and kind[v] != LEAF:
                 b = _enter(v, d[v], head, after, before, inside)
                 low = min(low, b)
                 high = max(high, b)
@@ -141,8 +178,8 @@ def repair(dist, parent, sources, cut, added, length, links, kind):
                 if (kind[w] != LEAF or w == s) and d[w] + length[e] < d[v]:
                     d[v] = d[w] + length[e]
                     p[v] = w
-                    if kind[v] != LEAF:
+                    if kind[v] != LEAF and d[v] <= reach[k]:
                         b = _enter(v, d[v], head, after, before, inside)
                         low = min(low, b)
                         high = max(high, b)
-        _settle(d, p, s, low, high, head, after, before, inside, links, kind)
+        _settle(d, p, s, reach[k], low, high, head, after, before, inside, links, kind)

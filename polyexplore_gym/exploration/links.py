@@ -362,25 +362,3 @@ def anchors(points, position, kind, n_vertices, walls, w_start, w_items, pieces,
                 out[i] = v
                 break
     return out
-
-
-@njit(cache=True)
-def reachable(root, links, kind):
-    """Which vertices an open path joins to `root`."""
-    seen = np.zeros(links.first.size, np.bool_)
-    stack = np.empty(seen.size, np.int64)
-    stack[0] = root
-    seen[root] = True
-    size = 1
-    while size > 0:
-        size -= 1
-        v = stack[size]
-        if kind[v] == LEAF and v != root:
-            continue
-        for h in range(links.first[v], links.first[v] + links.degree[v]):
-            w = links.target[h]
-            if not seen[w]:
-                seen[w] = True
-                stack[size] = w
-                size += 1
-    return seen

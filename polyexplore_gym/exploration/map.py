@@ -359,11 +359,10 @@ class ExplorationMap:
         g, c = self.graph, self.chains
         g.connect()
         rows = np.flatnonzero(c.vertex >= 0)
-        g.set_sources(c.vertex[rows])
+        g.set_sources(np.array([self.robot]))
+        out = sum(math.dist(a, b) for a, b in itertools.pairwise(self._start))
         c.path_length[:] = math.inf
-        if len(rows):
-            out = sum(math.dist(a, b) for a, b in itertools.pairwise(self._start))
-            c.path_length[rows] = g.distances(c.vertex[rows], np.array([self.robot]))[:, 0] + out
+        c.path_length[rows] = g.distances(self.robot, c.vertex[rows]) + out
 
     def _place(self, which: np.ndarray) -> None:
         """Put the nodes of jump edges at their configured places, if the disc can stand there."""
@@ -382,7 +381,7 @@ class ExplorationMap:
         if not len(which):
             return
         g, c = self.graph, self.chains
-        seen, known = g.reachable(self.robot), self._known()
+        seen, known = np.isfinite(g.distances(self.robot, np.arange(len(g.kind)))), self._known()
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
         for k, i in enumerate(which):
             *node[k], found[k] = nodes.nearest_reachable(
@@ -406,7 +405,7 @@ class ExplorationMap:
 
     def path_to(self, i: int) -> np.ndarray:
         """Way points (k, 2) of the shortest path from the robot to node i."""
-        way = self.graph.path(int(self.chains.vertex[i]), self.robot)
+        way = self.graph.path(self.robot, int(self.chains.vertex[i]))[::-1]
         return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), way))
 
     def path_lengths(self, rows: np.ndarray) -> np.ndarray:
@@ -414,5 +413,7 @@ class ExplorationMap:
         vertices = self.chains.vertex[rows]
         result = np.full((len(rows), len(rows)), math.inf)
         standing = np.flatnonzero(vertices >= 0)
-        result[standing[:, None], standing] = self.graph.distances(vertices[standing], vertices[standing])
+        result[standing[:, None], standing] = self.graph.between(
+            vertices[standing], self.chains.path_length[rows[standing]], self.robot
+        )
         return result

@@ -1,7 +1,7 @@
 """The exploration graph: shortest collision-free paths for the robot's disc through known space.
 
 A visibility graph over the inflated wall ends, kept between decisions. Nodes and the robot are leaves: paths end at
-them, none leads through. Every source (node) keeps a field of distances that is repaired where the graph changed.
+them, none leads through. Sources (leaves) keep fields of distances that are repaired where the graph changed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from polyexplore_gym.exploration.links import (
     connect,
     insert,
     isolate,
-    reachable,
     repack,
     sever,
     unblocked,
@@ -47,6 +46,8 @@ from polyexplore_gym.exploration.segments import (
 
 _STILL = 0.002
 """A wall whose ends moved by less than this (m) since they were last looked at has not moved."""
+_IDLE = 32
+"""So many fields are kept that nobody asks for at the moment: nodes that were too far come back."""
 _WAY_POINT = 4.0
 _CORNER_NEAR = 1.5
 """A scan's place becomes a vertex where no other such place and no corner stands within these distances, m."""
@@ -132,6 +133,7 @@ class PathGraph:
         self._scans_known = 0
         self.source_of = np.full(16, -1, np.int64)
         self.row_of = np.full(256, -1, np.int64)
+        self.reach = np.zeros(16)
         self.dist = np.full((16, 256), math.inf)
         self.parent = np.full((16, 256), -1, np.int32)
         self.felt = 0
@@ -375,10 +377,6 @@ class PathGraph:
             self._keep_blocked(np.all(self.kind[self.blocked] >= 0, axis=1))
         self._free_ids = np.flatnonzero(self.kind[: self.n_vertices] < 0)
 
-    def reachable(self, root: int) -> np.ndarray:
-        """Which vertices an open path joins to `root`."""
-        return reachable(root, self.links, self.kind)
-
     # Fields ----------------------------------------------------------------------------------
 
     def repair(self) -> None:
@@ -388,29 +386,55 @@ class PathGraph:
             added = np.concatenate([pairs for pairs, _ in self._added]) if self._added else cut[:0]
             length = np.concatenate([length for _, length in self._added]) if self._added else np.zeros(0)
             self._cut, self._added = [], []
-            fields.repair(self.dist, self.parent, self.source_of, cut, added, length, self.links, self.kind)
+            fields.repair(self.dist, self.parent, self.reach, self.source_of, cut, added, length, self.links, self.kind)
 
     def set_sources(self, vertices: np.ndarray) -> None:
-        """Keep fields for these vertices (k,) from now on; all others must have been taken out or be among them."""
+        """Keep whole fields for these leaves (k,) from now on, beside those that there are."""
+        self._sources(vertices)
+        for row in self.row_of[vertices]:
+            if self.reach[row] < math.inf:
+                fields.grow(
+                    row, self.source_of[row], math.inf, self.dist, self.parent, self.reach, self.links, self.kind
+                )
+
+    def between(self, vertices: np.ndarray, guess: np.ndarray, keep: int) -> np.ndarray:
+        """Path lengths (k, k) between leaves; inf where there is no path. `guess` (k,): from any one place to each.
+
+        Their fields are kept from now on, as far as they were needed, beside that of `keep` and a few others.
+        """
+        kept = np.zeros(len(self.kind), np.bool_)
+        kept[vertices] = kept[keep] = True
+        idle = np.flatnonzero((self.source_of >= 0) & ~kept[self.source_of])
+        if len(idle) > _IDLE:
+            self.row_of[self.source_of[idle]] = -1
+            self.source_of[idle] = -1
+        self._sources(vertices)
+        return fields.between(
+            self.row_of[vertices], vertices, guess, self.dist, self.parent, self.reach, self.links, self.kind
+        )  # fmt: skip
+
+    def distances(self, source: int, vertices: np.ndarray) -> np.ndarray:
+        """Path lengths (k,) from a source with a whole field to vertices; inf where there is no path."""
+        return self.dist[self.row_of[source], vertices]
+
+    def _sources(self, vertices: np.ndarray) -> None:
+        """Make leaves (k,) sources; those that had no field get one that reaches nowhere yet."""
         self.repair()
         new = vertices[self.row_of[vertices] < 0]
-        if not len(new):
-            return
-        free = np.flatnonzero(self.source_of < 0)
-        if len(free) < len(new):
+        short = len(new) - np.count_nonzero(self.source_of < 0)
+        if short > 0:
             k = len(self.source_of)
-            self.source_of = np.concatenate((self.source_of, np.full(k + len(new), -1)))
-            self.dist = np.concatenate((self.dist, np.full((k + len(new), self.dist.shape[1]), math.inf)))
-            self.parent = np.concatenate((self.parent, np.full((k + len(new), self.dist.shape[1]), -1, np.int32)))
-            free = np.flatnonzero(self.source_of < 0)
-        rows = free[: len(new)]
+            self.source_of = np.concatenate((self.source_of, np.full(k + short, -1)))
+            self.reach = np.concatenate((self.reach, np.zeros(k + short)))
+            self.dist = np.concatenate((self.dist, np.full((k + short, self.dist.shape[1]), math.inf)))
+            self.parent = np.concatenate((self.parent, np.full((k + short, self.dist.shape[1]), -1, np.int32)))
+        rows = np.flatnonzero(self.source_of < 0)[: len(new)]
         self.source_of[rows] = new
         self.row_of[new] = rows
-        fields.search(rows, new, self.dist, self.parent, self.links, self.kind)
-
-    def distances(self, sources: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        """Path lengths (k, n) from sources to vertices; inf where there is no path."""
-        return self.dist[self.row_of[sources][:, None], vertices]
+        self.reach[rows] = -1.0
+        self.dist[rows] = math.inf
+        self.dist[rows, new] = 0.0
+        self.parent[rows] = -1
 
     def path(self, source: int, vertex: int) -> np.ndarray:
         """Way points (k, 2) from a vertex to a source, both included."""

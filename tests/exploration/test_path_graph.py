@@ -40,7 +40,7 @@ def fields(graph, points, owner=1000):
     leaves = graph.add_leaves(points, owner + np.arange(len(points)))
     graph.connect()
     graph.set_sources(leaves)
-    return leaves, graph.distances(leaves, leaves)
+    return leaves, np.array([graph.distances(leaf, leaves) for leaf in leaves])
 
 
 def compare(family, seed, count=10):
@@ -148,12 +148,12 @@ def test_open_edges_block_until_they_are_gone_and_never_their_owner():
     beyond = leaf(graph, 2.0, 1.0, 7)  # may look through its own edge
     graph.connect()
     graph.repair()
-    lengths = graph.distances(leaves[:1], np.array([node, beyond]))
-    np.testing.assert_allclose(lengths, [[math.hypot(2, 0.5), math.hypot(4, 0.5)]])
+    lengths = graph.distances(leaves[0], np.array([node, beyond]))
+    np.testing.assert_allclose(lengths, [math.hypot(2, 0.5), math.hypot(4, 0.5)])
     graph.remove_leaves(np.array([beyond]))
     graph.set_pieces(NO_PIECES, NO_OWNER, ALL)
     graph.repair()
-    assert graph.distances(leaves[:1], leaves[1:2]) == pytest.approx(4.0)
+    assert graph.distances(leaves[0], leaves[1:2]) == pytest.approx(4.0)
 
 
 # Repair -------------------------------------------------------------------------------------------
@@ -183,14 +183,8 @@ def exported(graph):
 def check_fields(graph):
     network = exported(graph)
     leaves = {v for v in network if graph.kind[v] == LEAF}
-    sources = graph.source_of[graph.source_of >= 0]
-    again = copy.deepcopy(graph)
-    again.source_of[:] = -1
-    again.row_of[:] = -1
-    again.set_sources(sources)
-    living = np.flatnonzero(graph.kind >= 0)
-    np.testing.assert_allclose(graph.distances(sources, living), again.distances(sources, living), atol=1e-9)
-    for source in sources.tolist():
+    for source in graph.source_of[graph.source_of >= 0].tolist():
+        reach = graph.reach[graph.row_of[source]]
         through = network.subgraph([v for v in network if v not in leaves or v == source])
         lengths = nx.single_source_dijkstra_path_length(through, source)
         for v in network:
@@ -204,10 +198,23 @@ def check_fields(graph):
                     ),
                     default=math.inf,
                 )
-            assert graph.distances(np.array([source]), np.array([v])) == pytest.approx(wanted, abs=1e-9)
+            found = graph.distances(source, np.array([v]))[0]
+            if wanted > reach:
+                assert found >= wanted - 1e-9
+                continue
+            assert found == pytest.approx(wanted, abs=1e-9)
             if np.isfinite(wanted):
                 path = graph.path(source, v)
                 assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(wanted, abs=1e-9)
+
+
+def check_between(graph, vertices, guess):
+    """Lengths between leaves, of fields that reach only as far as they must, against whole fields."""
+    again = copy.deepcopy(graph)
+    again.source_of[:] = again.row_of[:] = -1
+    again.set_sources(vertices)
+    whole = np.array([again.distances(v, vertices) for v in vertices])
+    np.testing.assert_allclose(graph.between(vertices, guess, int(vertices[0])), whole, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -238,7 +245,10 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
                 leaves.append(leaf(graph, x, y, int(rng.integers(0, 5))))
         graph.connect()
         if rng.random() < 0.7:
-            graph.set_sources(np.array([v for v in leaves if rng.random() < 0.7], np.int64))
+            graph.set_sources(np.array([v for v in leaves if rng.random() < 0.3], np.int64))
+        if len(leaves) > 1 and rng.random() < 0.7:
+            some = rng.choice(leaves, int(rng.integers(1, len(leaves))), replace=False)
+            check_between(graph, some, rng.choice([0.5, 2.0, 8.0, math.inf], len(some)))
         if rng.random() < 0.7:
             graph.repair()
             check_fields(graph)
