@@ -76,6 +76,8 @@ class Bench:
     """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
     reference: str = "nearest"
     """Policy that the others are compared with."""
+    bounds: Path | None = None
+    """Folder of references that know the plans (those missing are computed, a minute each): adds ratios to them."""
     plots: bool = True
     """Draw the plots."""
 
@@ -173,6 +175,7 @@ def bench(options: Bench) -> int:
     import numpy as np
 
     from polyexplore_gym.evaluation import Study, evaluate, name_policies, summarize, summary_text, write_tables
+    from polyexplore_gym.evaluation.bounds import find_bounds, write_bounds
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
@@ -187,19 +190,24 @@ def bench(options: Bench) -> int:
     total = len(study.policies) * len(study.placements) * len(study.plans) * len(study.seeds)
     _say(f"{len(study.plans)} plans x {len(study.seeds)} starts x {len(study.placements)} placements x "
          f"{len(study.policies)} policies = {total} episodes -> {options.out}")  # fmt: skip
+    workers = options.workers or os.cpu_count() or 1
+    bounds = {}
     try:
+        if options.bounds is not None:
+            bounds = find_bounds(study.plans, study.seeds, config, cache=options.bounds, workers=workers)
         records = evaluate(
             study,
             out=options.out,
-            workers=options.workers or os.cpu_count() or 1,
+            workers=workers,
             backend=options.backend,
             address=options.address,
         )
     except KeyboardInterrupt:
         _say(f"\nstopped; the results so far are in {options.out}: the same command goes on from there")
         return 130
-    summary = summarize(records, np.random.default_rng(0), reference=options.reference)
-    written = write_tables(summary, options.out)
+    written = [write_bounds(options.out, bounds)] if bounds else []
+    summary = summarize(records, np.random.default_rng(0), reference=options.reference, bounds=bounds)
+    written += write_tables(summary, options.out)
     print(summary_text(summary))
     if options.plots:
         try:

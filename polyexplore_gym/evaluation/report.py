@@ -21,12 +21,13 @@ import numpy as np
 from polyexplore_gym.config import EnvConfig, from_mapping, to_mapping
 from polyexplore_gym.errors import MissingDependencyError, PolyExploreError, ResultsError
 from polyexplore_gym.evaluation import plots
+from polyexplore_gym.evaluation.bounds import Bounds, Pair, read_bounds
 from polyexplore_gym.evaluation.policy import load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.results import EPISODES, MANIFEST, read_manifest, read_plan, read_records
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
 from polyexplore_gym.evaluation.summary import Comparison, Summary, compare, completed, summarize
-from polyexplore_gym.evaluation.tables import LEGEND, interval_text, summary_tables
+from polyexplore_gym.evaluation.tables import interval_text, legend, summary_tables
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,7 +95,7 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
     manifest, records, warned = _read(folder)
     study = manifest["study"]
     config = from_mapping(EnvConfig, study["config"], path=MANIFEST)
-    summary = summarize(records, np.random.default_rng(0), reference=reference)
+    summary = summarize(records, np.random.default_rng(0), reference=reference, bounds=read_bounds(folder))
     plans = {r.plan_hash: read_plan(folder, r.plan_hash) for r in records}
     results, *comparisons = summary_tables(summary)
     missing = _missing(study, records)
@@ -107,8 +108,9 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
         "tiles": _tiles(study, records, missing),
         "results": {"header": results[1], "rows": results[2]},
         "comparisons": [{"title": t.rstrip(":"), "header": header, "rows": rows} for t, header, rows in comparisons],
-        "legend": LEGEND.replace("\n", " "),
+        "legend": legend(summary).replace("\n", " "),
         "notes": summary.notes,
+        "bounds": _bounds(study, summary.bounds, plans),
         "figures": _figures(records, summary),
         "breakdown": _breakdown(records, summary.reference, plans),
         "runs": _runs(records, study, config, plans, summary.reference, runs, make_env),
@@ -120,6 +122,7 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
         "figures": "Figures",
         "breakdown": "By family and size",
         "runs": "Best and worst runs",
+        "bounds": "Best possible",
     }
     names |= {"failures": "Failures", "set-up": "Set-up"}
     content["contents"] = [(anchor, name) for anchor, name in names.items() if content.get(anchor, True)]
@@ -425,6 +428,31 @@ def _failures(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
         "text": text,
         "rows": rows,
         "header": ("policy", "placement", "plan", "seed", "what", "m", "seen %", "error"),
+    }
+
+
+def _bounds(
+    study: Mapping[str, Any], bounds: Mapping[Pair, Bounds], plans: Mapping[str, FloorPlan | None]
+) -> dict[str, Any] | None:
+    """A row a start: how long the best exploration is, from below and above."""
+    rows = []
+    for p in study["plans"]:
+        plan = plans.get(p["hash"])
+        for seed in study["seeds"]:
+            b = bounds.get((p["hash"], seed))
+            if b is not None:
+                area = f"{plan.area:.0f}" if plan is not None else "-"
+                rows.append([p["name"], area, str(seed), f"{b.lower:.1f}", f"{b.sensing:.1f}", f"{b.stops:.1f}",
+                             f"{b.gap:.3f}"])  # fmt: skip
+    if not rows:
+        return None
+    gaps = [b.gap for b in bounds.values()]
+    return {
+        "text": "Ways on which all that can be seen is seen, m: the proven lower bound (a sensor of this range that "
+        "looks all round, all the time), the best known tour of such a sensor, and the best known one that scans at "
+        f"stops. Gap: the second over the first; median {np.median(gaps):.3f}, largest {max(gaps):.3f}.",
+        "header": ("plan", "m²", "seed", "lower", "sensing", "stops", "gap"),
+        "rows": rows,
     }
 
 

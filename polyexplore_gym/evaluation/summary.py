@@ -13,12 +13,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from polyexplore_gym.errors import ResultsError
+from polyexplore_gym.evaluation.bounds import RATIOS, Bounds, Pair, over
 from polyexplore_gym.evaluation.records import EpisodeRecord, Key
 from polyexplore_gym.evaluation.statistics import (
     Interval,
@@ -35,9 +36,6 @@ from polyexplore_gym.evaluation.statistics import (
 SHORTFALL = 0.02
 """Share of the free area by which an episode may stay behind the most that was seen on the plan and be complete."""
 
-Pair = tuple[str, int]
-"""Plan hash and seed: one start on one plan."""
-
 METRICS: dict[str, Callable[[EpisodeRecord], float | None]] = {
     "distance": lambda r: r.distance,
     "distance_90": lambda r: r.distance_90,
@@ -49,7 +47,8 @@ METRICS: dict[str, Callable[[EpisodeRecord], float | None]] = {
     "collisions": lambda r: r.collisions,
     "latency": lambda r: r.timing.get("act_mean"),
 }
-"""Figures of a record. `auc`, the area under the coverage, needs all records and is added to them."""
+"""Figures of a record. `auc`, the area under the coverage, needs all records and is added to them, as are the ratios
+to the bounds (`bounds.RATIOS`) where there are any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +108,8 @@ class Summary:
     """Every other policy against the reference, at the same placement; the best ratio first, as below."""
     between_placements: list[Comparison]
     """Every policy at every further placement against itself at the first one."""
+    bounds: Mapping[Pair, Bounds]
+    """Of the starts for which they are known."""
     notes: list[str]
     """What a reader must know of the figures: how many pairs were compared, what was left out."""
 
@@ -118,6 +119,7 @@ def summarize(
     rng: np.random.Generator,
     *,
     reference: str = "nearest",
+    bounds: Mapping[Pair, Bounds] | None = None,
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> Summary:
@@ -130,6 +132,7 @@ def summarize(
         records: one an episode.
         rng: source of the bootstrap.
         reference: policy to compare with; when it was not run, the first of the records' is taken.
+        bounds: on the best possible exploration of the starts (`evaluation.bounds`); None: unknown.
         resamples: bootstrap samples.
         confidence: content of the intervals.
 
@@ -156,7 +159,7 @@ def summarize(
     horizons = table.horizons(policies, common)
     for placement in placements:
         compared = [p for p in policies if table.completed(p, placement)]
-        found = table.rows(policies, compared, placement, common[placement], horizons)
+        found = table.rows(policies, compared, placement, common[placement], horizons, bounds or {})
         rows += sorted(found, key=_sort_key)
         against += table.against(reference, compared, placement, common[placement])
     between: list[Comparison] = []
@@ -165,7 +168,7 @@ def summarize(
         pairs = [_common_pairs(table.completed(*side) for side in two) for two in sides]
         kept = [i for i, p in enumerate(pairs) if p]
         between += table.compare([sides[i] for i in kept], [pairs[i] for i in kept])
-    return Summary(reference, rows, against, between, notes)
+    return Summary(reference, rows, against, between, bounds or {}, notes)
 
 
 def compare(
@@ -237,9 +240,11 @@ class _Table:
         placement: str,
         pairs: list[Pair],
         horizons: dict[str, float],
+        bounds: Mapping[Pair, Bounds],
     ) -> list[Row]:
         metrics: dict[str, dict[str, Metric]] = {policy: {} for policy in policies}
         get = {**METRICS, "auc": lambda r: _auc(r, horizons)}
+        get |= {name: functools.partial(over, bounds=bounds, name=name) for name in RATIOS if bounds}
         for name, figure in get.items():
             values = {(p, pair): figure(self._records[p, placement, pair]) for p in compared for pair in pairs}
             kept = [pair for pair in pairs if all(values[p, pair] is not None for p in compared)]

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from polyexplore_gym.errors import ResultsError
+from polyexplore_gym.evaluation.bounds import RATIOS
 from polyexplore_gym.evaluation.statistics import Interval
 from polyexplore_gym.evaluation.summary import METRICS, Comparison, Row, Summary
 
 _FIGURES = ("distance", "IQM", "seen%", "90%", "95%", "99%", "AUC", "scans", "time", "bumps", "ms")
 _HEADER = ("placement", "policy", "complete", *_FIGURES)
+_BOUNDS = {"/stops": "over_stops", "/sensing": "over_sensing", "/lower": "over_lower"}
 _COMPARISON_HEADER = ("placement", "policy", "against", "pairs", "ratio", "P(shorter)", "p", "p Holm")
 LEGEND = """\
 distance: mean driven until no reachable jump edge was left, m, with its 95 % interval; IQM: its interquartile mean;
@@ -21,6 +23,10 @@ seen%: mean share of the free area seen by then; 90%, 95%, 99%: mean driven unti
 coverage over the longest distance compared on the plan; scans, time (s), bumps: means an episode; ms: mean decision.
 ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): probability of the shorter way on the
 same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: the mean stands on so many starts only."""
+LEGEND_BOUNDS = """\
+/stops, /sensing, /lower: mean of the distance over that of the best known tour which knows the plan and scans at
+stops, over that of the best known one which knows it and senses all round all the way, and over the proven lower bound
+on every way that sees all that can be seen (a run that leaves out the last corners may fall below them)."""
 
 
 Table = tuple[str, tuple[str, ...], list[list[str]]]
@@ -29,7 +35,8 @@ Table = tuple[str, tuple[str, ...], list[list[str]]]
 
 def summary_tables(summary: Summary) -> list[Table]:
     """All tables of a summary, the results first."""
-    tables: list[Table] = [("", _HEADER, [_row(row) for row in summary.rows])]
+    header = (*_HEADER, *_BOUNDS) if summary.bounds else _HEADER
+    tables: list[Table] = [("", header, [_row(row, bool(summary.bounds)) for row in summary.rows])]
     if summary.against_reference:
         lines = [_comparison(c, c.theirs[0]) for c in summary.against_reference]
         tables.append(("Policies, at the same placement:", _COMPARISON_HEADER, lines))
@@ -46,8 +53,13 @@ def summary_text(summary: Summary, style: str = "text") -> str:
         parts += [*filter(None, [title]), format_table(header, rows, style)]
     bullet = "- " if style == "markdown" else ""
     parts.append("\n".join(bullet + note for note in summary.notes))
-    parts.append(LEGEND)
+    parts.append(legend(summary))
     return "\n\n".join(parts) + "\n"
+
+
+def legend(summary: Summary) -> str:
+    """What the columns mean."""
+    return f"{LEGEND}\n{LEGEND_BOUNDS}" if summary.bounds else LEGEND
 
 
 def write_tables(summary: Summary, folder: Path) -> list[Path]:
@@ -68,7 +80,7 @@ def write_tables(summary: Summary, folder: Path) -> list[Path]:
 
 def summary_csv(summary: Summary) -> str:
     """Every figure of every row, with its interval, one row a policy and placement."""
-    names = [*METRICS, "auc"]
+    names = [*METRICS, "auc", *(RATIOS if summary.bounds else ())]
     header = ["policy", "placement", "episodes", "complete", "short", "truncated", "failed"]
     for name in names:
         header += [
@@ -121,7 +133,7 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]], style: st
     return "\n".join("  ".join(row).rstrip() for row in [aligned[0], rule, *aligned[1:]])
 
 
-def _row(row: Row) -> list[str]:
+def _row(row: Row, bounds: bool) -> list[str]:
     def mean(name: str, digits: int, factor: float = 1.0) -> str:
         metric = row.metrics.get(name)
         if metric is None or metric.pairs == 0:
@@ -146,6 +158,7 @@ def _row(row: Row) -> list[str]:
         mean("sim_time", 0),
         mean("collisions", 2),
         mean("latency", 2, 1000.0),
+        *(mean(name, 2) for name in (_BOUNDS.values() if bounds else ())),
     ]
 
 
