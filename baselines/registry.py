@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from polyexplore_gym.errors import InvalidConfigError
+from polyexplore_gym.errors import InvalidConfigError, PolyExploreError
 from polyexplore_gym.evaluation.policy import Policy
 
 _CLASSES = {
@@ -16,6 +16,7 @@ _CLASSES = {
     "utility": "baselines.utility:Utility",
     "distance_advantage": "baselines.distance_advantage:DistanceAdvantage",
     "random": "baselines.uniform:Uniform",
+    "learned": "baselines.learned.selector:Learned",
 }
 
 
@@ -29,6 +30,8 @@ def make_policy(name: str, **parameters: Any) -> Policy:
 
     Raises:
         InvalidConfigError: no baseline has this name, or it has no such parameter or value.
+        InvalidModelError: the model of a learned one cannot be used.
+        MissingDependencyError: an optional package is needed.
     """
     if name not in _CLASSES:
         raise InvalidConfigError(
@@ -37,5 +40,7 @@ def make_policy(name: str, **parameters: Any) -> Policy:
     module, attribute = _CLASSES[name].split(":")
     try:
         return getattr(importlib.import_module(module), attribute)(**parameters)
+    except PolyExploreError:
+        raise
     except (TypeError, ValueError) as error:
         raise InvalidConfigError(f"policy {name!r}: {error}") from error

@@ -29,6 +29,10 @@ class ResultsError(PolyExploreError):
     """Results on disk cannot be read, or do not belong to this run."""
 
 
+class InvalidModelError(PolyExploreError, ValueError):
+    """A model file is damaged, cut short, of another kind or for another environment; the message says which."""
+
+
 class MissingDependencyError(PolyExploreError, ImportError):
     """An optional package is needed; the message says how to install it."""
 

@@ -1,0 +1,57 @@
+"""The policy `learned`: the node with the best score of a trained network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polyexplore_gym.errors import MissingDependencyError
+
+try:
+    import torch
+
+    from baselines.learned import model_files
+    from baselines.learned.network import Network, collate
+except ImportError as error:
+    if (error.name or "").split(".")[0] not in ("torch", "safetensors"):
+        raise
+    raise MissingDependencyError(
+        f"a learned selector needs {error.name}: pip install 'polyexplore-gym[train]'"
+    ) from error
+
+from baselines.learned.features import features
+
+
+class Learned:
+    """Takes the reachable node whose score is the highest.
+
+    Args:
+        model: path of the weights (.safetensors, with its card beside it); the shipped model if left out.
+        network: a network to use as it is, instead of a file.
+    """
+
+    name = "learned"
+
+    def __init__(self, model: str | Path | None = None, network: Network | None = None) -> None:
+        if network is None:
+            network, self.card = model_files.load_model(model_files.SHIPPED if model is None else model)
+            self.fingerprint = self.card["sha256"]
+        self.network = network
+
+    def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
+        """The reachable node with the highest score; ties go to the lower index."""
+        return self.choose([observation])[0]
+
+    def choose(self, observations: Sequence[Mapping[str, np.ndarray]]) -> list[int]:
+        """The node chosen in each of several observations."""
+        seen = [features(o) for o in observations]
+        found = []
+        with torch.inference_mode():
+            for start in range(0, len(seen), 16):
+                some = seen[start : start + 16]
+                scores, _ = self.network(collate(some))
+                found += [int(f.slots[row]) for f, row in zip(some, scores.argmax(dim=1).tolist(), strict=True)]
+        return found
