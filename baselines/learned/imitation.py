@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from baselines.learned.features import Features, features
-from baselines.learned.network import Network, NetworkConfig, augmented, collate
+from baselines.learned.network import Network, augmented, collate
 from baselines.learned.rollouts import State
 
 
@@ -62,7 +62,11 @@ def examples(states: Sequence[State]) -> list[Example]:
 def loss(scores: Tensor, many: Sequence[Example]) -> Tensor:
     """The weighted squared error of `scores` (b, k) about their mean over the nodes tried."""
     c = max(len(e.rows) for e in many)
-    rows, target, tried = np.zeros((len(many), c), np.int64), np.zeros((len(many), c), np.float32), np.zeros((len(many), c), np.float32)
+    rows, target, tried = (
+        np.zeros((len(many), c), np.int64),
+        np.zeros((len(many), c), np.float32),
+        np.zeros((len(many), c), np.float32),
+    )
     weight = np.zeros(len(many), np.float32)
     for i, e in enumerate(many):
         n = len(e.rows)
@@ -149,7 +153,7 @@ def scores(network: Network, many: Sequence[Features], batch: int = 128) -> list
 
 
 def gains(network: Network, many: Sequence[Example]) -> np.ndarray:
-    """(n,) metres saved against the nearest node tried by taking the best tried in each state, at its measured costs."""
+    """(n,) metres saved against the nearest node tried by taking the best of the nodes tried."""
     found = np.zeros(len(many))
     for i, (e, score) in enumerate(zip(many, scores(network, [e.features for e in many]), strict=True)):
         nearest = e.features.node[e.rows, 0].argmin()

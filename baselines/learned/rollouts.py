@@ -58,9 +58,7 @@ def shorn(seen: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def nearest(observations: Sequence[Mapping[str, np.ndarray]]) -> list[int]:
     """The base policy to begin with: the shortest path."""
-    return [
-        int(np.where(seen["action_mask"] > 0, seen["node_path_length"], np.inf).argmin()) for seen in observations
-    ]
+    return [int(np.where(seen["action_mask"] > 0, seen["node_path_length"], np.inf).argmin()) for seen in observations]
 
 
 def candidates(seen: Mapping[str, np.ndarray], chosen: int, count: int, rng: np.random.Generator) -> np.ndarray:
