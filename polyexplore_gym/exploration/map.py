@@ -53,9 +53,9 @@ def _near(segments, alive, x, y, reach):
 
 
 def _resampled(way: np.ndarray) -> np.ndarray:
-    """Points (k, 2) of a way, the first, the last and about every `_TRAIL_STEP` m between."""
+    """Points (k, 2) of a way every `_TRAIL_STEP` m, and the last: the same ones again when the way has grown."""
     run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
-    at = np.linspace(0.0, run[-1], max(math.ceil(run[-1] / _TRAIL_STEP), 1) + 1)
+    at = np.append(np.arange(0.0, run[-1], _TRAIL_STEP), run[-1])
     return np.stack((np.interp(at, run, way[:, 0]), np.interp(at, run, way[:, 1])), axis=1)
 
 

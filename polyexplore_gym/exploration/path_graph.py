@@ -281,7 +281,7 @@ class PathGraph:
         part = np.where(anchor < 0, -1, components(self.links, self.kind, self.n_vertices)[anchor])
         changes = part[:-1] != part[1:]
         laid = np.flatnonzero((part < 0) | np.append(changes, True) | np.append(True, changes))
-        ids = self._new_vertices(points[laid], np.tile([1e9, 0.0, 1.0, 0.0, 1.0, 0.0, TRAIL], (len(laid), 1)))
+        ids = self._trail_vertices(points[laid])
         self.connect()
         neighbours = np.flatnonzero(np.diff(laid) == 1)
         held = np.flatnonzero(anchor[laid] >= 0)
@@ -290,9 +290,19 @@ class PathGraph:
             np.stack((ids[held], anchor[laid[held]]), axis=1),
             [[ids[-1], robot]],
         ))  # fmt: skip
-        pairs = pairs[[v not in self.neighbours(u) for u, v in pairs]]
+        pairs = pairs[[u != v and v not in self.neighbours(u) for u, v in pairs]]
         length = np.hypot(*(self.position[pairs[:, 0]] - self.position[pairs[:, 1]]).T)
         self._insert(pairs, length, np.zeros(len(pairs)))
+
+    def _trail_vertices(self, points: np.ndarray) -> np.ndarray:
+        """Vertices (k,) at points (k, 2) of the trail: those of an earlier call, else new ones."""
+        n = self.n_vertices
+        old = np.flatnonzero((self.kind[:n] == CORNER) & (self.shape[:n, 6] == TRAIL))
+        known = {(x, y): v for v, (x, y) in zip(old.tolist(), self.position[old].tolist(), strict=True)}
+        ids = np.array([known.get((x, y), -1) for x, y in points.tolist()], np.int64)
+        fresh = ids < 0
+        ids[fresh] = self._new_vertices(points[fresh], np.tile([1e9, 0.0, 1.0, 0.0, 1.0, 0.0, TRAIL], (fresh.sum(), 1)))
+        return ids
 
     def neighbours(self, v: int) -> np.ndarray:
         """The vertices (k,) that open edges join to v."""

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths
 
-from polyexplore_gym.exploration.corners import CORNER, LEAF
+from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL
 from polyexplore_gym.exploration.path_graph import PathGraph
 
 RADIUS = 0.25
@@ -267,6 +267,34 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
         pieces = np.hstack([start, start + rng.normal(0, 1, (m, 2))])
         owner = rng.integers(0, 5, m)
     assert checked > 10
+
+
+def test_a_trail_laid_again_is_the_same_trail_and_leads_back():
+    # The robot came through a gap that the map has closed since.
+    room = box(-2.0, -2.0, 2.0, 2.0)
+    graph = graph_of(room)
+    way = np.stack((np.arange(0.0, 4.0, 0.3), np.zeros(14)), axis=1)
+    robot = leaf(graph, *way[-1], owner=-2)
+    home = leaf(graph, *way[0], owner=7)
+    graph.connect()
+    graph.set_sources(np.array([robot]))
+    assert np.isinf(graph.distances(robot, np.array([home])))
+    graph.add_trail(way, robot)
+    graph.connect()
+    graph.set_sources(np.array([robot]))
+    assert np.isfinite(graph.distances(robot, np.array([home]))).all()
+
+    graph.remove_leaves(np.array([robot]))
+    longer = np.vstack((way, [[4.2, 0.0], [4.5, 0.0]]))
+    robot = leaf(graph, *longer[-1], owner=-2)
+    graph.connect()
+    graph.add_trail(longer, robot)
+    graph.connect()
+    graph.set_sources(np.array([robot]))
+    assert np.isfinite(graph.distances(robot, np.array([home]))).all()
+    laid = graph.position[(graph.kind == CORNER) & (graph.shape[:, 6] == TRAIL)]
+    assert len(laid) > 2
+    assert len(np.unique(laid, axis=0)) == len(laid)
 
 
 def test_edges_in_the_graph_keep_clear_of_walls_that_came_later():
