@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 LEVELS = 12  # cells of 1 m to 2 km
+MOST_CELLS = 4096.0  # a box over more cells of a level is compared with every row instead
 
 
 class Grid(NamedTuple):
@@ -91,8 +92,18 @@ def grid_query(grid: Grid, x0: float, y0: float, x1: float, y1: float, out: np.n
         size *= 2.0
         if grid.occupied[level] == 0:
             continue
-        for ix in range(math.floor(x0 / size - 0.5), math.floor(x1 / size + 0.5) + 1):
-            for iy in range(math.floor(y0 / size - 0.5), math.floor(y1 / size + 0.5) + 1):
+        low_x, high_x = np.floor(x0 / size - 0.5), np.floor(x1 / size + 0.5)
+        low_y, high_y = np.floor(y0 / size - 0.5), np.floor(y1 / size + 0.5)
+        if not (high_x - low_x + 1.0) * (high_y - low_y + 1.0) <= MOST_CELLS:
+            for row in range(grid.bucket.size):
+                ix, iy = grid.cell[row, 1], grid.cell[row, 2]
+                held = grid.bucket[row] >= 0 and grid.cell[row, 0] == level
+                if held and low_x <= ix <= high_x and low_y <= iy <= high_y:
+                    out[count] = row
+                    count += 1
+            continue
+        for ix in range(int(low_x), int(high_x) + 1):
+            for iy in range(int(low_y), int(high_y) + 1):
                 row = grid.head[bucket_of(level, ix, iy, grid.head.size)]
                 while row >= 0:
                     if grid.cell[row, 0] == level and grid.cell[row, 1] == ix and grid.cell[row, 2] == iy:

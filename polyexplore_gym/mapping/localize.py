@@ -231,7 +231,7 @@ def _innovation(
     v = np.empty((2, 1))
     v[0, 0], v[1, 0] = wrap(alpha - alpha_e), rho - rho_e
     det = s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
-    if not det > 0.0:
+    if not (det > 0.0 and s[0, 0] > 0.0):
         return v, s, by_pose, by_line, math.inf
     d2 = (s[1, 1] * v[0, 0] ** 2 - 2.0 * s[0, 1] * v[0, 0] * v[1, 0] + s[0, 0] * v[1, 0] ** 2) / det
     return v, s, by_pose, by_line, d2

@@ -59,12 +59,14 @@ def _dead_reckon(trajectory, pieces, noise, estimate, covariance, k_xy, k_distan
         for j in range(n):
             error = estimate[2] - (trajectory[i, 2] + j * turn)  # turns the motion into the estimated frame
             c, s = math.cos(error), math.sin(error)
-            mx, my = c * dx - s * dy, s * dx + c * dy
-            estimate[0] += mx + math.sqrt(var_xy) * noise[row, 0]
-            estimate[1] += my + math.sqrt(var_xy) * noise[row, 1]
+            mx = c * dx - s * dy + math.sqrt(var_xy) * noise[row, 0]
+            my = s * dx + c * dy + math.sqrt(var_xy) * noise[row, 1]
+            estimate[0] += mx
+            estimate[1] += my
             estimate[2] += turn + math.sqrt(var_heading) * noise[row, 2]
             row += 1
-            # F = [[1, 0, -my], [0, 1, mx], [0, 0, 1]]
+            # F = [[1, 0, -my], [0, 1, mx], [0, 0, 1]]: by the estimated way, all that a robot knows of it; so the F of
+            # many pieces is that of their sum, which a filter can tell from the estimates alone
             for k in range(3):
                 covariance[0, k] -= my * covariance[2, k]
                 covariance[1, k] += mx * covariance[2, k]

@@ -395,7 +395,7 @@ def test_grid_finds_whatever_meets_the_box():
             grid_put(grid, row, *segments[row])
             alive[row] = True
         x, y = rng.uniform(-40, 40, 2)
-        w, h = rng.uniform(0, 6, 2)
+        w, h = 10.0 ** rng.uniform(-1, 2, 2) if rng.random() < 0.9 else (1e9, 1e300)
         got = found[: grid_query(grid, x, y, x + w, y + h, found)]
         assert got.size == np.unique(got).size
         low, high = np.minimum(segments[:, :2], segments[:, 2:]), np.maximum(segments[:, :2], segments[:, 2:])
