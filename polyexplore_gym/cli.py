@@ -21,7 +21,7 @@ from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
 
 if TYPE_CHECKING:
-    from polyexplore_gym.evaluation import EpisodeRecord, Study, Summary
+    from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
     from polyexplore_gym.floorplan import FloorPlan
     from polyexplore_gym.mapping import LaserLog, LogMap
     from polyexplore_gym.snapshot import Snapshot
@@ -129,6 +129,54 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Train:
+    """Train a selector; a run that was stopped goes on where it was when the same command is given again.
+
+    The folder gets model.safetensors and its card, the network that was best on the validation plans, progress.jsonl
+    with a line for every validation, and logs for TensorBoard.
+    """
+
+    config: Path | None = None
+    """JSON file with fields of the training's configuration, as in {"method": "both", "fit": {"epochs": 20}}."""
+    method: Literal["imitation", "reinforcement", "both"] | None = None
+    """How it learns, instead of what the configuration says."""
+    seed: int | None = None
+    """Seed, instead of that of the configuration."""
+    out: Path = Path("results/train")
+    """Folder of the run."""
+    workers: int = 0
+    """Processes that play; 0: one a core. The result does not depend on it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Eval:
+    """Compare a trained selector with scripted policies on the same plans, starts and noise."""
+
+    model: tyro.conf.Positional[Path]
+    """The model, a .safetensors file with its card beside it."""
+    suite: tuple[str, ...] = ()
+    """Suites of generated plans, such as home-test or office-validation (default: a mix that takes minutes)."""
+    plans: tuple[Path, ...] = ()
+    """Plan files, or folders of them, instead of suites."""
+    first: int | None = None
+    """Only the first so many plans, of each suite."""
+    against: tuple[str, ...] = ("nearest",)
+    """Policies to compare with; the first is the reference."""
+    seeds: int = 1
+    """Starts (and streams of noise) on each plan."""
+    workers: int = 0
+    """Processes; 0: one a core."""
+    out: Path = Path("results/eval")
+    """Folder of the results."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    plots: bool = True
+    """Draw the plots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
@@ -172,16 +220,58 @@ class Linemap:
 
 def bench(options: Bench) -> int:
     """Run, or go on with, a comparison."""
+    from polyexplore_gym.evaluation import name_policies
+
+    return _compare(options, name_policies(options.policies))
+
+
+def train(options: Train) -> int:
+    """Run, or go on with, a training."""
+    import baselines.learned
+
+    baselines.learned.require("torch", "safetensors", "tensorboard", "stable_baselines3", "sb3_contrib")
+    from baselines.learned import settings, training
+
+    config = settings.TrainConfig() if options.config is None else settings.read_train_config(options.config)
+    given: dict[str, Any] = {"method": options.method, "seed": options.seed}
+    config = replace(config, **{name: value for name, value in given.items() if value is not None})
+    try:
+        path = training.train(config, options.out, workers=options.workers or os.cpu_count() or 1)
+    except KeyboardInterrupt:
+        _say(f"\nstopped; what is done is in {options.out}: the same command goes on from there")
+        return 130
+    print(f"written: {path}")
+    return 0
+
+
+def evaluate_model(options: Eval) -> int:
+    """Run, or go on with, the comparison of a model."""
+    from baselines import make_policy
+    from polyexplore_gym.evaluation import name_policies
+
+    policies = name_policies(options.against)
+    if not policies or "learned" in policies:
+        raise InvalidConfigError(
+            "--against: names of policies, of which none is 'learned': so the model is called here"
+        )
+    policies["learned"] = make_policy("learned", model=options.model)
+    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "config", "plots")
+    fields = {name: getattr(options, name) for name in same}
+    return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
+
+
+def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
+    """Run a comparison of these policies; those that the options name are not looked at."""
     import numpy as np
 
-    from polyexplore_gym.evaluation import Study, evaluate, name_policies, summarize, summary_text, write_tables
+    from polyexplore_gym.evaluation import Study, evaluate, summarize, summary_text, write_tables
     from polyexplore_gym.evaluation.bounds import find_bounds, write_bounds
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
     config = _config(options.config, options.drive)
     study = Study(
-        policies=name_policies(options.policies),
+        policies=policies,
         plans=list(_bench_plans(options, config)),
         placements=options.placements,
         seeds=range(options.seeds),
@@ -328,6 +418,8 @@ def linemap(options: Linemap) -> int:
 _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (Bench, bench),
     "run": (Run, run),
+    "train": (Train, train),
+    "eval": (Eval, evaluate_model),
     "report": (Report, report),
     "linemap": (Linemap, linemap),
 }

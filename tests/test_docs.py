@@ -99,7 +99,7 @@ def test_commands_parse(command, monkeypatch):
 
 
 def test_commands_run_in_order(reader, capsys):
-    """All but the default comparison, which takes minutes."""
+    """All but the default comparison and training, which take long."""
     for code in PYTHON:
         if "save_plan(" in code or "np.savez(" in code:
             exec(compile(code, "README", "exec"), {})
@@ -107,6 +107,8 @@ def test_commands_run_in_order(reader, capsys):
     for command in COMMANDS:
         words = arguments(command)
         if words[0] == "bench" and not {"--suite", "--plans"} & set(words):
+            continue
+        if words[0] in ("train", "eval"):  # hours and minutes: tests/learned runs them
             continue
         extra = ["--workers", "1", "--no-plots", "--drive", "kinematic"] if words[0] == "bench" else []
         capsys.readouterr()

@@ -8,8 +8,9 @@ however noisy single outcomes are.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 from baselines.learned.features import Features, features
 from baselines.learned.network import Network, augmented, collate
 from baselines.learned.rollouts import State
+from polyexplore_gym.errors import InvalidConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +34,11 @@ class FitConfig:
     """The highest; it rises over the first 5 % of the steps and falls to 0 as a cosine."""
     weight_decay: float = 0.05
     """Of AdamW."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("epochs", 1), ("batch", 1), ("learning_rate", 0.0), ("weight_decay", 0.0)):
+            if not getattr(self, name) >= least:
+                raise InvalidConfigError(f"FitConfig.{name} = {getattr(self, name)!r}: must be at least {least}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,54 +98,72 @@ def noise(cost: float) -> float:
     return 0.5 + 0.5 * max(cost, 0.0) ** 0.62
 
 
-def fit(
-    network: Network,
-    many: Sequence[Example],
-    config: FitConfig,
-    seed: int,
-    *,
-    report: Callable[[int, float], None] | None = None,
-) -> None:
-    """Fit the network to the examples, in place; the same seed ends with the same weights.
+class Fit:
+    """A regression, epoch by epoch. The same seed ends with the same weights, also when it is taken up again.
 
     Args:
-        network: as it is to start from.
+        network: as it is to start from; changed in place.
         many: what to learn from.
         config: how.
         seed: of the order and the augmentation.
-        report: called after every epoch with its number and mean loss.
     """
-    generator = torch.Generator().manual_seed(seed)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    steps = config.epochs * math.ceil(len(many) / config.batch)
-    step = 0
-    network.train()
-    for epoch in range(config.epochs):
-        order = torch.randperm(len(many), generator=generator).tolist()
-        # States of about as many nodes go together: padding is work.
-        chunks = [order[i : i + 16 * config.batch] for i in range(0, len(order), 16 * config.batch)]
-        batches = []
-        for chunk in chunks:
-            chunk.sort(key=lambda i: len(many[i].features.slots))
-            batches += [chunk[i : i + config.batch] for i in range(0, len(chunk), config.batch)]
+
+    def __init__(self, network: Network, many: Sequence[Example], config: FitConfig, seed: int) -> None:
+        self.network = network
+        self.many = many
+        self.config = config
+        self.seed = seed
+        self.done = 0
+        self.optimizer = torch.optim.AdamW(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to go on from here."""
+        return {"done": self.done, "network": self.network.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from the state of an equal regression."""
+        self.network.load_state_dict(state["network"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.done = state["done"]
+
+    def epoch(self) -> float:
+        """Pass over the examples once; returns the mean loss."""
+        config, many = self.config, self.many
+        # Each epoch has a stream of its own, so that one can go on after any of them.
+        entropy = np.random.SeedSequence([self.seed, self.done]).generate_state(1, np.uint64)[0]
+        generator = torch.Generator().manual_seed(int(entropy >> 1))
+        batches = self._batches(generator)
+        step, steps = self.done * len(batches), config.epochs * len(batches)
         total = 0.0
+        self.network.train()
         for i in torch.randperm(len(batches), generator=generator).tolist():
             some = [many[j] for j in batches[i]]
             share = step / steps
-            rate = config.learning_rate * min(1.0, 20.0 * share) * 0.5 * (1.0 + math.cos(math.pi * share))
-            for group in optimizer.param_groups:
-                group["lr"] = rate
-            scores, _ = network(augmented(collate([e.features for e in some]), generator))
+            for group in self.optimizer.param_groups:
+                group["lr"] = config.learning_rate * min(1.0, 20.0 * share) * 0.5 * (1.0 + math.cos(math.pi * share))
+            scores, _ = self.network(augmented(collate([e.features for e in some]), generator))
             value = loss(scores, some)
-            optimizer.zero_grad(set_to_none=True)
+            self.optimizer.zero_grad(set_to_none=True)
             value.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
+            torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+            self.optimizer.step()
             total += float(value.detach()) * len(some)
             step += 1
-        if report is not None:
-            report(epoch, total / len(many))
-    network.eval()
+        self.network.eval()
+        self.done += 1
+        return total / len(many)
+
+    def _batches(self, generator: torch.Generator) -> list[list[int]]:
+        """Which examples go together: some of about as many nodes, as padding is work."""
+        size = self.config.batch
+        order = torch.randperm(len(self.many), generator=generator).tolist()
+        batches = []
+        for start in range(0, len(order), 16 * size):
+            chunk = sorted(order[start : start + 16 * size], key=lambda i: len(self.many[i].features.slots))
+            batches += [chunk[i : i + size] for i in range(0, len(chunk), size)]
+        return batches
 
 
 @torch.inference_mode()

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from baselines.learned.features import NODE, PAIR, RAYS, SCALARS, VECTORS, WHOLE, Features
+from polyexplore_gym.errors import InvalidConfigError
 
 _VECTORS = slice(len(SCALARS), len(SCALARS) + 2 * len(VECTORS))
 RULE = {"tour_over_best": 1.0, "path": 0.3}
@@ -34,6 +35,15 @@ class NetworkConfig:
     """Hidden numbers per pair of nodes."""
     dropout: float = 0.0
     """Share of hidden numbers dropped in training."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "layers", "heads", "pair_width"):
+            if getattr(self, name) < 1:
+                raise InvalidConfigError(f"NetworkConfig.{name} = {getattr(self, name)}: must be at least 1")
+        if self.width % self.heads:
+            raise InvalidConfigError(f"NetworkConfig.heads = {self.heads}: must divide the width, {self.width}")
+        if not 0.0 <= self.dropout < 1.0:
+            raise InvalidConfigError(f"NetworkConfig.dropout = {self.dropout}: must lie in [0, 1)")
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,21 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from polyexplore_gym.errors import MissingDependencyError
+import baselines.learned
 
-try:
-    import torch
+baselines.learned.require("torch", "safetensors")
 
-    from baselines.learned import model_files
-    from baselines.learned.network import Network, collate
-except ImportError as error:
-    if (error.name or "").split(".")[0] not in ("torch", "safetensors"):
-        raise
-    raise MissingDependencyError(
-        f"a learned selector needs {error.name}: pip install 'polyexplore-gym[train]'"
-    ) from error
+import torch  # noqa: E402
 
-from baselines.learned.features import features
+from baselines.learned import model_files  # noqa: E402
+from baselines.learned.features import features  # noqa: E402
+from baselines.learned.network import Network, collate  # noqa: E402
 
 
 class Learned:
