@@ -16,6 +16,9 @@ _CLASSES = {
     "utility": "baselines.utility:Utility",
     "distance_advantage": "baselines.distance_advantage:DistanceAdvantage",
     "random": "baselines.uniform:Uniform",
+    "tour": "baselines.tour:Tour",
+    "watchman": "baselines.watchman:Watchman",
+    "rollout": "baselines.rollout:Rollout",
     "learned": "baselines.learned.selector:Learned",
 }
 

@@ -32,6 +32,9 @@ BENCH_PLANS = {"home-test": 24, "angled-test": 12, "office-test": 12}
 All scripted policies and both placements then take about three minutes on two cores.
 """
 SCRIPTED = ("nearest", "largest", "ekman_ratio", "modified_sum", "utility", "distance_advantage", "random")
+"""The criteria, which look at nodes one by one (`distance_advantage` at their distances): the default comparison."""
+LOOK_AHEAD = ("tour", "watchman", "rollout")
+"""Planners that look at the way over all nodes."""
 
 SHOWN = 10
 """So many broken parts of a log are named, the rest is counted."""

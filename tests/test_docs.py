@@ -144,6 +144,7 @@ def test_the_tables_name_every_key():
     assert f"`Discrete({env.action_space.n})`" in README
     assert f"`max_decisions` ({EnvConfig().max_decisions})" in README
     assert set(names("criterion")) == set(cli.SCRIPTED)
+    assert set(names("planner")) == set(cli.LOOK_AHEAD)
 
 
 def test_environments_are_listed():

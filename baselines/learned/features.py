@@ -19,14 +19,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
-RAYS = 12
-"""Rays from a jump edge into the unknown, evenly spread over the half circle."""
-REACH = 2.0
-"""They end after so many laser ranges."""
-_LIFT = 0.05
-"""They start so far (m) beyond the edge, off the walls that it ends on."""
+from baselines.pockets import LIFT, RAYS, REACH, rays
+from baselines.tours import tours
+
 _LIMIT = 8.0
 """Lengths count as at most so many laser ranges; logarithms take over beyond."""
 
@@ -82,8 +78,8 @@ def features(seen: Mapping[str, np.ndarray]) -> Features:
         lines = lines[np.asarray(seen["line_mask"]) > 0]
     pose = np.asarray(seen["pose"], dtype=np.float64)
 
-    length, ends_on = _rays(edges, heading, np.ascontiguousarray(lines), RAYS, _LIFT, REACH * reach)
-    tour, greedy = _tours(cost, between)
+    length, ends_on = rays(edges, heading, np.ascontiguousarray(lines), RAYS, LIFT, REACH * reach)
+    tour, greedy = tours(cost, between)
     node = np.zeros((k, NODE), dtype=np.float32)
     ordered = np.sort(between + np.where(np.eye(k) > 0, np.inf, 0.0), axis=1) if k > 1 else np.zeros((1, 1))
     order = np.argsort(np.argsort(cost, kind="stable"), kind="stable")
@@ -123,10 +119,10 @@ def features(seen: Mapping[str, np.ndarray]) -> Features:
     ]
     for i, vector in enumerate(vectors):
         node[:, len(SCALARS) + 2 * i : len(SCALARS) + 2 * i + 2] = vector
-    rays = len(SCALARS) + 2 * len(VECTORS)
-    node[:, rays : rays + RAYS] = length / reach
-    node[:, rays + RAYS : rays + 2 * RAYS] = ends_on == -1
-    node[:, rays + 2 * RAYS :] = ends_on >= 0
+    first = len(SCALARS) + 2 * len(VECTORS)
+    node[:, first : first + RAYS] = length / reach
+    node[:, first + RAYS : first + 2 * RAYS] = ends_on == -1
+    node[:, first + 2 * RAYS :] = ends_on >= 0
 
     pair = np.zeros((k, k, PAIR), dtype=np.float32)
     straight = np.hypot(*np.moveaxis(position[:, None] - position[None], 2, 0))
@@ -151,115 +147,3 @@ def _shortened(vectors: np.ndarray) -> np.ndarray:
     """Vectors (k, 2) with their lengths l replaced by log(1 + l): direction kept, far away not far out of range."""
     length = np.hypot(*vectors.T)[:, None]
     return vectors * np.where(length > 1e-9, np.log1p(length) / np.maximum(length, 1e-9), 1.0)
-
-
-@njit(cache=True)
-def _rays(edges, heading, lines, rays, lift, reach):  # type: ignore[no-untyped-def]
-    """Lengths (k, rays) and what ends them: -2 nothing within reach, -1 a line (m, 4), j >= 0 the jump edge j."""
-    k = len(edges)
-    length = np.full((k, rays), reach)
-    ends_on = np.full((k, rays), -2, dtype=np.int64)
-    m = len(lines)
-    for i in range(k):
-        ex, ey = edges[i, 2] - edges[i, 0], edges[i, 3] - edges[i, 1]
-        size = max(math.hypot(ex, ey), 1e-9)
-        nx, ny = -ey / size, ex / size
-        if nx * math.cos(heading[i]) + ny * math.sin(heading[i]) < 0.0:
-            nx, ny = -nx, -ny
-        ox = 0.5 * (edges[i, 0] + edges[i, 2]) + lift * nx
-        oy = 0.5 * (edges[i, 1] + edges[i, 3]) + lift * ny
-        for r in range(rays):
-            a = math.pi * ((r + 0.5) / rays - 0.5)
-            c, s = math.cos(a), math.sin(a)
-            dx, dy = c * nx - s * ny, s * nx + c * ny
-            for j in range(m + k):
-                if j < m:
-                    ax, ay, bx, by = lines[j, 0], lines[j, 1], lines[j, 2], lines[j, 3]
-                elif j - m != i:
-                    ax, ay, bx, by = edges[j - m, 0], edges[j - m, 1], edges[j - m, 2], edges[j - m, 3]
-                else:
-                    continue
-                wx, wy = bx - ax, by - ay
-                det = dx * wy - dy * wx
-                if abs(det) < 1e-12:
-                    continue
-                px, py = ax - ox, ay - oy
-                t = (px * wy - py * wx) / det
-                u = (px * dy - py * dx) / det
-                if 0.0 <= t < length[i, r] and 0.0 <= u <= 1.0:
-                    length[i, r] = t
-                    ends_on[i, r] = -1 if j < m else j - m
-    return length, ends_on
-
-
-@njit(cache=True)
-def _tours(cost, between):  # type: ignore[no-untyped-def]
-    """For every first node (k,): a short way over all nodes, and the way that always takes the nearest next.
-
-    The short one is the latter improved by reversing parts and moving nodes (2-opt, Or-opt) until nothing helps.
-    """
-    k = len(cost)
-    tour, greedy = np.empty(k), np.empty(k)
-    way = np.empty(k, dtype=np.int64)
-    for first in range(k):
-        left = np.ones(k, dtype=np.bool_)
-        way[0] = first
-        left[first] = False
-        for i in range(1, k):
-            best = -1
-            for j in range(k):
-                if left[j] and (best < 0 or between[way[i - 1], j] < between[way[i - 1], best]):
-                    best = j
-            way[i] = best
-            left[best] = False
-        length = cost[first]
-        for i in range(1, k):
-            length += between[way[i - 1], way[i]]
-        greedy[first] = length
-        for _ in range(10):
-            gained = 0.0
-            # Reverse way[i..j]; the end is free.
-            for i in range(1, k - 1):
-                for j in range(i + 1, k):
-                    old = between[way[i - 1], way[i]]
-                    new = between[way[i - 1], way[j]]
-                    if j + 1 < k:
-                        old += between[way[j], way[j + 1]]
-                        new += between[way[i], way[j + 1]]
-                    if new < old - 1e-9:
-                        gained += old - new
-                        a, b = i, j
-                        while a < b:
-                            way[a], way[b] = way[b], way[a]
-                            a += 1
-                            b -= 1
-            # Move way[i] between way[j] and way[j + 1].
-            for i in range(1, k):
-                node = way[i]
-                out = between[way[i - 1], node]
-                if i + 1 < k:
-                    out += between[node, way[i + 1]] - between[way[i - 1], way[i + 1]]
-                best, at = out - 1e-9, -1
-                for j in range(k):
-                    if j == i or j == i - 1:
-                        continue
-                    add = between[way[j], node]
-                    if j + 1 < k:
-                        add += between[node, way[j + 1]] - between[way[j], way[j + 1]]
-                    if add < best:
-                        best, at = add, j
-                if at >= 0:
-                    gained += out - best
-                    if at < i:
-                        for a in range(i, at + 1, -1):
-                            way[a] = way[a - 1]
-                        way[at + 1] = node
-                    else:
-                        for a in range(i, at):
-                            way[a] = way[a + 1]
-                        way[at] = node
-            length -= gained
-            if gained < 1e-9:
-                break
-        tour[first] = length
-    return tour, greedy

@@ -1,12 +1,11 @@
-import itertools
 import math
 
 import numpy as np
 import pytest
 from observations import moved, observation, permuted
 
-from baselines.learned import features as module
-from baselines.learned.features import NODE, PAIR, RAYS, SCALARS, VECTORS, WHOLE, features
+from baselines.learned.features import NODE, PAIR, SCALARS, VECTORS, WHOLE, features
+from baselines.pockets import RAYS, rays
 
 RAY = len(SCALARS) + 2 * len(VECTORS)
 
@@ -50,32 +49,14 @@ def test_rays_by_hand():
     edges = np.array([[0.0, 0.0, 2.0, 0.0], [3.0, 0.2, 3.0, 4.0]])
     heading = np.array([math.pi / 2, math.pi])
     lines = np.array([[-50.0, 3.0, 2.9, 3.0]])
-    length, ends_on = module._rays(edges, heading, lines, 3, 0.0, 10.0)
+    length, ends_on = rays(edges, heading, lines, 3, 0.0, 10.0)
     # Directions -60, 0 and 60 degrees from the normal: to the right, up, to the left.
     np.testing.assert_allclose(length[0], [2.0 / math.sin(math.pi / 3), 3.0, 6.0])
     assert ends_on[0].tolist() == [1, -1, -1]
     assert (length[1] <= 10.0).all()
-    empty, nothing = module._rays(edges[:1], heading[:1], np.zeros((0, 4)), RAYS, 0.0, 16.0)
+    empty, nothing = rays(edges[:1], heading[:1], np.zeros((0, 4)), RAYS, 0.0, 16.0)
     assert (empty == 16.0).all()
     assert (nothing == -2).all()
-
-
-@pytest.mark.parametrize("k", [1, 2, 6])
-def test_tours_beside_all_orders(k):
-    rng = np.random.default_rng(k)
-    ratios = []
-    for _ in range(20):
-        points = rng.uniform(0, 10, size=(k, 2))
-        between = np.hypot(*np.moveaxis(points[:, None] - points[None], 2, 0))
-        cost = np.hypot(*points.T)
-        tour, greedy = module._tours(cost, between)
-        for first in range(k):
-            rest = [j for j in range(k) if j != first]
-            ways = ((first, *order) for order in itertools.permutations(rest))
-            best = min(cost[first] + sum(between[a, b] for a, b in itertools.pairwise(way)) for way in ways)
-            assert best - 1e-9 <= tour[first] <= greedy[first] + 1e-9
-            ratios.append(tour[first] / best)
-    assert np.mean(ratios) < 1.02
 
 
 def test_nothing_to_choose_and_missing_path_lengths_are_errors():
