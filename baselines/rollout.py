@@ -26,7 +26,7 @@ class Rollout:
 
     name = "rollout"
 
-    def __init__(self, chance: float = 0.4, scale: float = 0.5, samples: int = 32, near: float = 0.1) -> None:
+    def __init__(self, chance: float = 0.4, scale: float = 0.5, samples: int = 32, near: float = 2.0) -> None:
         """samples: guesses, at least 1; near: additional weight of the first leg, at least 0."""
         if not (0.0 <= chance < 1.0 and scale >= 0.0 and samples >= 1 and near >= 0.0):
             raise ValueError(f"chance = {chance}, scale = {scale}, samples = {samples}, near = {near}: out of range")

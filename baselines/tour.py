@@ -19,7 +19,7 @@ class Tour:
 
     name = "tour"
 
-    def __init__(self, near: float = 0.3) -> None:
+    def __init__(self, near: float = 2.0) -> None:
         """near: additional weight of the first leg, at least 0."""
         if not near >= 0.0:
             raise ValueError(f"near = {near}: must be at least 0")

@@ -24,7 +24,7 @@ class Watchman:
 
     name = "watchman"
 
-    def __init__(self, near: float = 0.3, shared: float = 0.25) -> None:
+    def __init__(self, near: float = 2.0, shared: float = 0.25) -> None:
         """near: additional weight of the first leg, at least 0; shared: least share of rays that end on the other."""
         if not (near >= 0.0 and 0.0 < shared <= 1.0):
             raise ValueError(f"near = {near}, shared = {shared}: must be at least 0, and lie in (0, 1]")
