@@ -43,9 +43,14 @@ class Learned:
         """The node chosen in each of several observations."""
         seen = [features(o) for o in observations]
         found = []
-        with torch.inference_mode():
-            for start in range(0, len(seen), 16):
-                some = seen[start : start + 16]
-                scores, _ = self.network(collate(some))
-                found += [int(f.slots[row]) for f, row in zip(some, scores.argmax(dim=1).tolist(), strict=True)]
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # others would wait for each other longer than they work
+        try:
+            with torch.inference_mode():
+                for start in range(0, len(seen), 16):
+                    some = seen[start : start + 16]
+                    scores, _ = self.network(collate(some))
+                    found += [int(f.slots[row]) for f, row in zip(some, scores.argmax(dim=1).tolist(), strict=True)]
+        finally:
+            torch.set_num_threads(threads)
         return found
