@@ -18,6 +18,8 @@ CHECKPOINT_SPACING = 0.3
 """Grid of the points to be seen, m."""
 WALL_GAP = 0.01
 """Checkpoints keep this distance from walls, m: on a wall, rounding would decide."""
+_BORDER = 1e-6
+"""Places nearer than this (m) to where the disc touches a wall are left out: what is on a line sees nothing."""
 _STEP = math.radians(3.0)
 """A circle is drawn in chords of at most this angle."""
 _BESIDE = 1e-9
@@ -42,6 +44,8 @@ class Checkpoints:
         self.walls, self.max_range = plan.segments, max_range
         points = checkpoint_grid(plan)
         places = grid_points(space.walls, spacing)
+        border = shapely.multilinestrings(space.walls.reshape(-1, 2, 2))
+        places = places[shapely.distance(border, shapely.points(places)) > _BORDER]
         rows = space.sees(places)
         reached = np.isfinite(space.distances(start, places, rows))
         self.places = np.vstack([start, places[reached]])

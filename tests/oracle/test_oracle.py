@@ -338,6 +338,18 @@ def test_cache(tmp_path):
         found.checkpoints(PLANS["home"])
 
 
+def test_there_are_ways_between_all_places():
+    # In this home a place of the grid lies on the border of the free space, where it can be seen but sees nothing.
+    plan = suite("home-test").plan(7)
+    start = start_of(plan, 0)[:2]
+    space = Space.inner(plan, RADIUS, start)
+    sight = Checkpoints(plan, space, start, 8.0, 0.3)
+    rng = np.random.default_rng(0)
+    for place in sight.places[rng.integers(len(sight.places), size=30)]:
+        assert np.isfinite(space.distances(place, sight.places, sight.rows)).all()
+        assert np.isfinite(space.field(place)).any()
+
+
 def test_unusable_start():
     with pytest.raises(InvalidFloorPlanError):
         reference(PLANS["corridor"], (-5.0, 0.0))
