@@ -21,7 +21,8 @@ class Rollout:
 
     A guess: behind a node that is visited there is, with probability `chance`, a further one, `scale` times as far as
     the pocket is deep (rays into the unknown), times a random number of mean 1. So a jump edge leads to a chain of
-    nodes, and leaving it means coming back for the rest. `chance` and `scale` are fitted on generated training plans.
+    nodes, and leaving it means coming back for the rest. `chance` and `scale` are the best of a few values tried on
+    generated validation plans.
     """
 
     name = "rollout"

@@ -122,3 +122,16 @@ def test_the_far_end_first_when_the_way_leads_back():
     seen = observation(node_path_length=[4.0, 3.0, 12.0, 0, 0, 0], path_lengths=between, action_mask=[1, 1, 1, 0, 0, 0])
     assert make_policy("nearest").act(seen, {}, np.random.default_rng(0)) == 1
     assert make_policy("tour").act(seen, {}, np.random.default_rng(0)) == 0
+
+
+def test_rollouts_repeat_with_equal_generators():
+    from test_baselines import observation
+
+    policy = make_policy("rollout", samples=4)
+    seen = [observation(seed=seed) for seed in range(20)]
+    runs = []
+    for _ in range(2):
+        rng = np.random.default_rng(5)
+        runs.append([policy.act(one, {}, rng) for one in seen])
+    assert runs[0] == runs[1]
+    assert len(set(runs[0])) > 1
