@@ -267,7 +267,12 @@ def test_control_c_says_how_to_go_on(folder, tmp_path):
     command = [sys.executable, "-m", "polyexplore_gym.cli", "bench", "--plans", str(folder), "--seeds", "400"]
     command += ["--drive", "kinematic"]
     process = subprocess.Popen(
-        [*command, "--out", str(out), "--workers", "2"], stderr=subprocess.PIPE, text=True, start_new_session=True
+        [*command, "--out", str(out), "--workers", "2"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # A shell starts what it puts into the background deaf to Ctrl-C, and children of it stay so.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     while process.poll() is None and not (out / "episodes.jsonl").exists():
         os.sched_yield()

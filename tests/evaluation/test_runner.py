@@ -298,6 +298,11 @@ print("finished", flush=True)
 """
 
 
+def heed_control_c() -> None:
+    """A shell starts what it puts into the background deaf to Ctrl-C, and children of it stay so."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start(out: Path, workers: int, **options) -> subprocess.Popen:
     script = SCRIPT.format(tests=str(Path(__file__).parent), out=str(out), workers=workers)
     return subprocess.Popen(
@@ -305,7 +310,7 @@ def start(out: Path, workers: int, **options) -> subprocess.Popen:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         start_new_session=True,
-        **options,
+        **{"preexec_fn": heed_control_c, **options},
     )
 
 
