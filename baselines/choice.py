@@ -1,7 +1,8 @@
-"""The one thing that the scripted policies share: the best of the reachable nodes."""
+"""What the scripted policies share: the best of the reachable nodes, and parameters within their limits."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -29,3 +30,10 @@ def best(score: np.ndarray, observation: Mapping[str, np.ndarray]) -> int:
 def column(observation: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     """(max_nodes,) a quantity of all nodes in double precision, so that scores do not round to ties."""
     return np.asarray(observation[name], dtype=np.float64)
+
+
+def number(name: str, value: float, low: float = 0.0, high: float = math.inf) -> float:
+    """A policy's parameter; raises ValueError if it is not a number from `low` to `high`."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise ValueError(f"{name} = {value!r}: must be a number from {low:g} to {high:g}")
+    return value

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from baselines.choice import best
+from baselines.choice import best, number
 from baselines.pockets import pockets
 from baselines.tours import ways
 
@@ -29,9 +29,8 @@ class Rollout:
 
     def __init__(self, chance: float = 0.4, scale: float = 0.5, samples: int = 32, near: float = 2.0) -> None:
         """samples: guesses, at least 1; near: additional weight of the first leg, at least 0."""
-        if not (0.0 <= chance < 1.0 and scale >= 0.0 and samples >= 1 and near >= 0.0):
-            raise ValueError(f"chance = {chance}, scale = {scale}, samples = {samples}, near = {near}: out of range")
-        self.chance, self.scale, self.samples, self.near = chance, scale, samples, near
+        self.chance, self.scale = number("chance", chance, high=0.95), number("scale", scale)
+        self.samples, self.near = int(number("samples", samples, 1, 10_000)), number("near", near)
 
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The node with the shortest mean of the ways played out; needs `observation.pairwise`."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.choice import best
+from baselines.choice import best, number
 from baselines.tours import tours, ways
 
 
@@ -21,9 +21,7 @@ class Tour:
 
     def __init__(self, near: float = 2.0) -> None:
         """near: additional weight of the first leg, at least 0."""
-        if not near >= 0.0:
-            raise ValueError(f"near = {near}: must be at least 0")
-        self.near = near
+        self.near = number("near", near)
 
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The first node of the shortest tour; needs `observation.pairwise`."""

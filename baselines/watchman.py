@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from baselines.choice import best
+from baselines.choice import best, number
 from baselines.pockets import pockets
 from baselines.tours import group_tours, ways
 
@@ -26,9 +26,7 @@ class Watchman:
 
     def __init__(self, near: float = 2.0, shared: float = 0.25) -> None:
         """near: additional weight of the first leg, at least 0; shared: least share of rays that end on the other."""
-        if not (near >= 0.0 and 0.0 < shared <= 1.0):
-            raise ValueError(f"near = {near}, shared = {shared}: must be at least 0, and lie in (0, 1]")
-        self.near, self.shared = near, shared
+        self.near, self.shared = number("near", near), number("shared", shared, 0.01, 1.0)
 
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The first node of the shortest tour; needs `observation.pairwise`."""

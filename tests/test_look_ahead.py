@@ -104,7 +104,9 @@ def test_they_need_the_path_lengths_between_nodes(name):
         make_policy(name).act(seen, info, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("parameters", ["tour:near=-1", "watchman:shared=0", "rollout:chance=1", "rollout:samples=0"])
+@pytest.mark.parametrize(
+    "parameters", ["tour:near=-1", "tour:near=x", "watchman:shared=0", "rollout:chance=1", "rollout:samples=0"]
+)
 def test_parameters_out_of_range_are_told(parameters):
     from polyexplore_gym.evaluation import load_policy
 
