@@ -17,6 +17,7 @@ from polyexplore_gym.mapping.hough import hough_labels
 COLLINEAR_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
 LEAST_RANGE_NOISE = 1e-3  # m; a noise-free sensor is fitted with these, so that weights stay finite
 LEAST_ANGLE_NOISE = 1e-4  # rad
+LEAST_RANGE = 1e-6  # m; the square of a much smaller one would be 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +56,14 @@ def extract_lines(
 
     Args:
         angles: (n,) nominal beam angles in the robot frame, rad, strictly increasing.
-        ranges: (n,) measured ranges, m, positive; inf, or anything from the sensor's maximum
+        ranges: (n,) measured ranges, m, 1e-6 or more; inf, or anything from the sensor's maximum
             range on, is a beam without a return.
         sensor: noise, maximum range, and whether the field of view closes.
         config: numbers and limits of the fit.
 
     Raises:
         ValueError: the arrays are not one-dimensional, differ in length, hold NaN, an angle is not
-            finite or not increasing, or a range is not positive.
+            finite or not increasing, or a range is below 1e-6 m.
 
     Example:
         >>> import numpy as np
@@ -113,7 +114,7 @@ def check_scan(angles: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.n
 
 _PROBLEMS = {
     1: "range of beam {beam} is NaN; give inf for a beam without a return",
-    2: "range of beam {beam} is {range}; ranges must be positive",
+    2: "range of beam {beam} is {range}; ranges must be positive, of 1e-6 m at least",
     3: "angle of beam {beam} is {angle}; angles must be finite",
     4: "angle of beam {beam} is {angle}, not larger than the one before; angles must increase strictly",
 }
@@ -125,7 +126,7 @@ def _check(angles: np.ndarray, ranges: np.ndarray) -> tuple[int, int]:
     for k in range(angles.size):
         if math.isnan(ranges[k]):
             return 1, k
-        if ranges[k] <= 0.0:
+        if ranges[k] < LEAST_RANGE:
             return 2, k
         if not math.isfinite(angles[k]):
             return 3, k

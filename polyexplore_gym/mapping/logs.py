@@ -13,7 +13,7 @@ read: it is what such programs write. FLASER does not give the beams' angles (se
 The .npz, written with `numpy.savez`:
 
     angles           (b,) beam angles in the laser's frame, rad, increasing
-    ranges           (n, b) m; 0 or less, inf, or max_range and more: no return
+    ranges           (n, b) m; less than 1e-6, inf, or max_range and more: no return
     poses            (n, 3) x, y (m), heading (rad) of the laser in the map frame
     max_range        m, optional
     pose_covariance  (3, 3) or (n, 3, 3) m2, m rad, rad2, optional
@@ -34,6 +34,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from polyexplore_gym.errors import InvalidLogError
+from polyexplore_gym.mapping.extract import LEAST_RANGE
 
 MESSAGES = ("FLASER", "ROBOTLASER1")
 """CARMEN messages that are read; the first that occurs in a log."""
@@ -68,7 +69,7 @@ class LaserLog:
     angles: np.ndarray
     """(b,) beam angles in the laser's frame, rad, strictly increasing."""
     ranges: np.ndarray
-    """(n, b) ranges, m; inf where the log has 0 or less."""
+    """(n, b) ranges, m; inf where the log has less than 1e-6."""
     poses: np.ndarray
     """(n, 3) x, y (m) and heading (rad) of the laser in the map frame."""
     pose_covariance: np.ndarray | None = None
@@ -250,7 +251,7 @@ def _parse(
         beams = _flaser(behind, count, field_of_view)
     else:
         beams = _robotlaser(behind, count, _numbers(fields[1:8], "field"))
-    return beams, np.where(ranges > 0.0, ranges, np.inf), (x, y, heading)
+    return beams, np.where(ranges >= LEAST_RANGE, ranges, np.inf), (x, y, heading)
 
 
 def _tail(message: str, rest: list[str]) -> tuple[int, int] | None:
@@ -330,7 +331,7 @@ def _read_npz(raw: IO[bytes]) -> LaserLog:
     covariance = arrays.get("pose_covariance")
     return LaserLog(
         angles=angles,
-        ranges=np.where(ranges > 0.0, ranges, np.inf)[~bad],
+        ranges=np.where(ranges >= LEAST_RANGE, ranges, np.inf)[~bad],
         poses=poses[~bad],
         pose_covariance=None if covariance is None else _covariances(covariance, n)[~bad],
         max_range=_max_range(arrays.get("max_range")),

@@ -67,7 +67,7 @@ def extract_polylines(
 
     Args:
         angles: (n,) beam angles in the robot frame, rad, strictly increasing.
-        ranges: (n,) measured ranges, m, positive; inf, or anything from the sensor's maximum
+        ranges: (n,) measured ranges, m, 1e-6 or more; inf, or anything from the sensor's maximum
             range on, is a beam without a return.
         max_vertices: most vertices, at least 2.
         sensor: maximum range, and whether the field of view closes.
@@ -77,7 +77,7 @@ def extract_polylines(
 
     Raises:
         ValueError: the arrays are not one-dimensional, differ in length, hold NaN, an angle is not
-            finite or not increasing, a range is not positive; or a number is out of its limits.
+            finite or not increasing, a range is below 1e-6 m; or a number is out of its limits.
 
     Example:
         >>> import numpy as np

@@ -180,6 +180,9 @@ def test_bad_input_is_named():
     negative[3] = -1
     with pytest.raises(ValueError, match=r"beam 3 is -1\.0"):
         extract_lines(HALF, negative)
+    with pytest.raises(ValueError, match="beam 0 is 1e-300"):
+        extract_lines(HALF, np.full(361, 1e-300))
+    assert extract_lines(HALF, np.full(361, 1e-6)).point_segment.shape == (361,)
     with pytest.raises(ValueError, match="361 and 360"):
         extract_lines(HALF, good[:-1])
     with pytest.raises(ValueError, match="increase strictly"):

@@ -475,6 +475,25 @@ def test_the_cost_of_a_query_does_not_grow_with_the_map():
     assert visited[0] == visited[1] > 0
 
 
+def test_a_box_far_larger_than_the_map_holds_every_row():
+    grid, found = empty_grid(64), np.empty(64, np.int64)
+    for row in range(50):
+        grid_put(grid, row, row, 0.5, row + 0.4 + row % 3, 0.5)
+    for size in (1e2, 1e6, 1e300):
+        assert np.sort(found[: grid_query(grid, -size, -size, size, size, found)]).tolist() == list(range(50))
+    assert grid_query(grid, 100.0, -1e6, 1e6, 1e6, found) == 0
+
+
+def test_poses_that_know_nothing_leave_a_map():
+    """Boxes that are searched grow with the uncertainty of the pose."""
+    line_map, rng = LineMap(sensor=SENSOR), np.random.default_rng(0)
+    lines = extract_lines(HALF, measure(box(-3, -2.5, 3, 2.5), np.zeros(3), SENSOR, rng), SENSOR)
+    for _ in range(3):
+        line_map.insert(lines, np.zeros(3), np.diag([1e12, 1e12, 1e6]))
+    assert np.isfinite(line_map.segments[line_map.alive]).all()
+    check_slots(line_map)
+
+
 def test_many_rows_grow_the_store():
     line_map, rng = LineMap(sensor=SENSOR), np.random.default_rng(0)
     room = box(-3, -2.5, 3, 2.5)

@@ -153,6 +153,8 @@ def test_a_range_missing_or_too_many_never_shifts_the_pose(write):
 def test_beams_without_a_return(write):
     log = read_log(write(flaser([1.0, 0.0, -1.0, math.inf], SCAN[1])))
     np.testing.assert_array_equal(log.ranges, [[1.0, math.inf, math.inf, math.inf]])
+    log = read_log(write(flaser([1.0, 1e-300, 1e-7, 1e-6], SCAN[1])))
+    np.testing.assert_array_equal(log.ranges, [[1.0, math.inf, math.inf, 1e-6]])
     assert not log.broken
 
 
