@@ -26,10 +26,10 @@ def rays(
         Lengths (k, count), m, and what ends them: -2 nothing within `reach`, -1 a line (m, 4), j >= 0 the jump edge j.
         They start `lift` (m) beyond the edge.
     """
-    k = len(edges)
+    k, m = len(edges), len(lines)
     length = np.full((k, count), reach)
     ends_on = np.full((k, count), -2, dtype=np.int64)
-    m = len(lines)
+    dx, dy = np.empty(count), np.empty(count)
     for i in range(k):
         ex, ey = edges[i, 2] - edges[i, 0], edges[i, 3] - edges[i, 1]
         size = max(math.hypot(ex, ey), 1e-9)
@@ -40,26 +40,36 @@ def rays(
         oy = 0.5 * (edges[i, 1] + edges[i, 3]) + lift * ny
         for r in range(count):
             a = math.pi * ((r + 0.5) / count - 0.5)
-            c, s = math.cos(a), math.sin(a)
-            dx, dy = c * nx - s * ny, s * nx + c * ny
-            for j in range(m + k):
-                if j < m:
-                    ax, ay, bx, by = lines[j, 0], lines[j, 1], lines[j, 2], lines[j, 3]
-                elif j - m != i:
-                    ax, ay, bx, by = edges[j - m, 0], edges[j - m, 1], edges[j - m, 2], edges[j - m, 3]
-                else:
-                    continue
-                wx, wy = bx - ax, by - ay
-                det = dx * wy - dy * wx
+            dx[r] = math.cos(a) * nx - math.sin(a) * ny
+            dy[r] = math.sin(a) * nx + math.cos(a) * ny
+        for j in range(m + k):
+            if j == m + i:
+                continue
+            ends = lines[j] if j < m else edges[j - m]
+            px, py, qx, qy = ends[0] - ox, ends[1] - oy, ends[2] - ox, ends[3] - oy
+            if px * nx + py * ny < 0.0 and qx * nx + qy * ny < 0.0:
+                continue  # behind the edge
+            if min(px, qx) > reach or max(px, qx) < -reach or min(py, qy) > reach or max(py, qy) < -reach:
+                continue
+            wx, wy = qx - px, qy - py
+            for r in range(count):
+                if (px * dy[r] - py * dx[r]) * (qx * dy[r] - qy * dx[r]) > 0.0:
+                    continue  # both ends on one side of the ray
+                det = dx[r] * wy - dy[r] * wx
                 if abs(det) < 1e-12:
                     continue
-                px, py = ax - ox, ay - oy
                 t = (px * wy - py * wx) / det
-                u = (px * dy - py * dx) / det
-                if 0.0 <= t < length[i, r] and 0.0 <= u <= 1.0:
+                if 0.0 <= t < length[i, r]:
                     length[i, r] = t
                     ends_on[i, r] = -1 if j < m else j - m
     return length, ends_on
+
+
+def shares(ends_on: np.ndarray) -> np.ndarray:
+    """Share (k, k) of the rays of each jump edge (row) that end on each other one, from what ends them (k, count)."""
+    k, count = ends_on.shape
+    row, ray = np.nonzero(ends_on >= 0)
+    return np.bincount(row * k + ends_on[row, ray], minlength=k * k).reshape(k, k) / count
 
 
 def pockets(observation: Mapping[str, np.ndarray], slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,5 +84,4 @@ def pockets(observation: Mapping[str, np.ndarray], slots: np.ndarray) -> tuple[n
     lines = np.asarray(observation["lines"], dtype=np.float64)[np.asarray(observation["line_mask"]) > 0, :4]
     reach = REACH * float(observation["max_range"][0])
     length, ends_on = rays(edges, heading, np.ascontiguousarray(lines), RAYS, LIFT, reach)
-    shared = np.stack([(ends_on == j).mean(axis=1) for j in range(len(slots))], axis=1)
-    return np.sqrt((length**2).mean(axis=1)), shared
+    return np.sqrt((length**2).mean(axis=1)), shares(ends_on)

@@ -35,10 +35,10 @@ from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.floorplan import FloorPlan, load_plan, suite
 
 
-def plan_sets(folder: Path, largest: float, first: int | None) -> dict[str, list[FloorPlan]]:
-    """The plans by set."""
+def plan_sets(folder: Path | None, largest: float, first: int | None) -> dict[str, list[FloorPlan]]:
+    """The plans by set; those in `folder` only if one is given."""
     sets = {name: [suite(name).plan(i) for i in range(count)][:first] for name, count in BENCH_PLANS.items()}
-    real = [load_plan(path) for path in sorted(folder.glob("*.json"))]
+    real = [load_plan(path) for path in sorted(folder.glob("*.json"))] if folder else []
     sets["real and drawn"] = [plan for plan in real if plan.area <= largest][:first]
     return {name: plans for name, plans in sets.items() if plans}
 

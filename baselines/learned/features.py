@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from baselines.pockets import LIFT, RAYS, REACH, rays
+from baselines.pockets import LIFT, RAYS, REACH, rays, shares
 from baselines.tours import tours
 
 _LIMIT = 8.0
@@ -126,7 +126,7 @@ def features(seen: Mapping[str, np.ndarray]) -> Features:
 
     pair = np.zeros((k, k, PAIR), dtype=np.float32)
     straight = np.hypot(*np.moveaxis(position[:, None] - position[None], 2, 0))
-    shared = np.stack([(ends_on == j).sum(axis=1) for j in range(k)], axis=1) / RAYS
+    shared = shares(ends_on)
     pair[..., 0] = np.minimum(between / reach, _LIMIT)
     pair[..., 1] = np.log1p(between / reach)
     pair[..., 2] = np.exp(-2.0 * between / reach)
