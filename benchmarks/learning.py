@@ -62,7 +62,7 @@ def draw(curves: dict[str, tuple[np.ndarray, np.ndarray]], path: Path) -> None:
     panel.annotate("5 % shorter", (1.0, 0.95), xycoords=("axes fraction", "data"), ha="right", va="bottom", color="0.4")
     panel.set(xlabel="minutes of training, of one core", ylabel="distance / nearest\n(60 validation plans)")
     panel.set_xlim(left=0.0)
-    panel.legend(frameon=False)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
     figure.savefig(path, dpi=150)

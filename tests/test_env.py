@@ -856,6 +856,26 @@ def test_snapshots_do_not_change_later():
     assert scene.node_mask[action]
 
 
+def test_slam_keeps_one_covariance_of_pose_and_walls():
+    """The odometry moves the pose's covariance, the filter what the pose shares with the walls: both by one way."""
+    env = PolyExploreEnv(named_suite("home-validation").plan(1), config=VARIATIONS["slam"])
+    observation, info = env.reset(seed=3)
+    for _ in range(12):
+        reachable = np.flatnonzero(info["action_mask"])
+        if not reachable.size:
+            break
+        action = reachable[observation["node_path_length"][reachable].argmin()]
+        observation, _, _, _, info = env.step(int(action))
+        walls = np.flatnonzero(env._lines.tables[1].alive[: env._lines.rho.size])
+        at = np.stack((2 * walls, 2 * walls + 1), axis=1).ravel()
+        shared = env._localizer._shared[:, at]
+        own = env._localizer._lines[np.ix_(at, at)]
+        joint = np.block([[env._localizer._covariance, shared], [shared.T, own]])
+        scale = 1.0 / np.sqrt(np.diag(joint))
+        assert np.linalg.eigvalsh(joint * np.outer(scale, scale)).min() > -1e-6
+    assert env._localizer._covariance[0, 0] > 0.0
+
+
 def test_slam_sees_what_an_exact_pose_sees_and_odometry_does_not():
     """Drift of 2 % of the distance and 1 degree a metre, the defaults; the same seeds for all three."""
     plans = [named_suite("home-validation").plan(i) for i in (5, 6)]
