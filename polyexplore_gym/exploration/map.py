@@ -24,6 +24,10 @@ _SLACK = 0.3
 """Paths may cross an open edge this near (m) to the node or robot at their end."""
 _TRAIL_STEP = 0.3
 """Spacing of the way points on a way driven, m."""
+_BACK = 1.0
+"""In contact with walls on both sides the robot goes back so far (m) at most before paths begin."""
+_SAME_PLACE = 0.001
+"""Points of the way driven this near (m) are one place."""
 _AT_NODE = 0.75
 """A jump edge counts as measured from its node only within this distance (m) of where that should be."""
 _ON_EDGE = 0.4
@@ -311,14 +315,14 @@ class ExplorationMap:
             g.add_way_point(float(pose[0]), float(pose[1]))
         if self.robot >= 0:
             g.remove_leaves(np.array([self.robot]))
-        self._start = self._way_out(float(pose[0]), float(pose[1]), came)
+        if came is not None:
+            self._trail.append(came)
+        self._start = self._way_out(float(pose[0]), float(pose[1]))
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
         reach = self.sensor.max_range
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
         self._place(np.flatnonzero(local))
         self._update_paths()
-        if came is not None:
-            self._trail.append(came)
         if len(c) and not np.isfinite(c.path_length).any() and self._trail:
             g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
             self._update_paths()
@@ -339,20 +343,26 @@ class ExplorationMap:
         n = self.n_scans
         return Known(self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range)
 
-    def _way_out(self, x: float, y: float, came: np.ndarray | None) -> list[tuple[float, float]]:
-        """The first way points: the place itself or, in contact with a wall, on to where paths begin."""
+    def _way_out(self, x: float, y: float) -> list[tuple[float, float]]:
+        """The first way points: the place itself or, in contact with a wall, on to where paths begin.
+
+        That is a place near by or, in a passage as wide as the robot, back on the way that it came, past earlier bumps
+        in the same passage but not round and round between them.
+        """
         rx, ry, found = self.graph.retreat(x, y)
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
-        points = [(x, y)]
-        if came is not None:
-            driven = 0.0
-            for i in range(len(came) - 2, -1, -1):
-                p = (float(came[i, 0]), float(came[i, 1]))
-                driven += math.dist(p, points[-1])
-                points.append(p)
-                if self.graph.clearance(*p) >= self.graph.need or driven > 1.0:
-                    break
+        points, driven = [(x, y)], [0.0]
+        for px, py in itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail)):
+            been = [math.dist((px, py), p) < _SAME_PLACE for p in points]
+            if any(been):
+                first = been.index(True)
+                del points[first + 1 :], driven[first + 1 :]
+                continue
+            driven.append(driven[-1] + math.dist((px, py), points[-1]))
+            points.append((px, py))
+            if self.graph.clearance(px, py) >= self.graph.need or driven[-1] > _BACK:
+                break
         return points
 
     def _update_paths(self) -> None:

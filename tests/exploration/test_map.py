@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -404,3 +405,25 @@ def test_one_door_is_one_jump_edge_with_its_node_in_the_door():
     assert np.isfinite(c.path_length).all()
     for i in range(2):
         assert c.normal[i, 1] * c.middle[i, 1] > 0  # away from the cone
+
+
+def test_bumps_from_side_to_side_in_a_tight_doorway_lead_back_out():
+    width = 2 * RADIUS + 0.003
+    jambs = [[x, sy * width / 2, x, sy * 2] for x in (0.0, 0.6) for sy in (-1, 1)]
+    sides = [[0.0, sy * width / 2, 0.6, sy * width / 2] for sy in (-1, 1)]
+    walls = np.vstack([box(-3, -2, 0, 2)[[0, 2, 3]], jambs, sides, box(0.6, -2, 3, 2)[[0, 1, 2]]])
+    explorer = Explorer(walls, [-1.5, 0.0, 0.0], HALF)  # what lies behind the robot is to be seen
+    explorer.plan()
+    way = [[-0.7, 0.0], [0.2, -0.0015], [0.25, 0.0015], [0.2, -0.0015], [0.25, 0.0015]]
+    for came in itertools.pairwise(way):
+        explorer.pose = np.array([*came[1], 0.0])
+        explorer.look()
+        explorer.map.plan(explorer.pose, explorer.walls, explorer.alive, np.array(came))
+        reachable = np.flatnonzero(explorer.map.reachable)
+        assert len(reachable)
+        for i in reachable:
+            path = explorer.map.path_to(i)
+            np.testing.assert_allclose(path[0], came[1])
+            back = np.flatnonzero((path == way[0]).all(axis=1))  # where paths begin, and by the shortest way
+            assert len(back)
+            assert back[0] <= 2
