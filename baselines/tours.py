@@ -19,28 +19,31 @@ def tours(cost: np.ndarray, between: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Args:
         cost: (k,) path lengths from the robot, m.
-        between: (k, k) path lengths between the nodes, m.
+        between: (k, k) path lengths between the nodes, m, symmetric.
 
     Returns:
         Lengths (k,) of the two. The short way is the other one after `improve`.
     """
     k = len(cost)
     tour, greedy = np.empty(k), np.empty(k)
-    way = np.empty(k, dtype=np.int64)
+    way = np.empty(k, dtype=np.uint16)
+    near = np.empty((k, k), np.uint16)
+    for i in range(k):
+        near[i] = np.argsort(between[i], kind="mergesort")
+    left = np.empty(k, dtype=np.bool_)
     for first in range(k):
-        left = np.ones(k, dtype=np.bool_)
-        way[0] = first
+        left[:] = True
         left[first] = False
-        for i in range(1, k):
-            best = -1
-            for j in range(k):
-                if left[j] and (best < 0 or between[way[i - 1], j] < between[way[i - 1], best]):
-                    best = j
-            way[i] = best
-            left[best] = False
+        way[0] = at = first
         length = cost[first]
         for i in range(1, k):
-            length += between[way[i - 1], way[i]]
+            n = 0
+            while not left[near[at, n]]:
+                n += 1
+            nearest = near[at, n]
+            length += between[at, nearest]
+            way[i] = at = nearest
+            left[nearest] = False
         greedy[first] = length
         tour[first] = length - improve(way, between)
     return tour, greedy
@@ -48,55 +51,91 @@ def tours(cost: np.ndarray, between: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 @njit(cache=True)
 def improve(way: np.ndarray, between: np.ndarray) -> float:
-    """Shorten an open way (k,) by 2-opt and Or-opt moves, in place, its first node fixed; returns the metres saved."""
+    """Shorten an open way (k,) by 2-opt and Or-opt moves, in place, its first node fixed; returns the metres saved.
+
+    Whether there is any move of a node is asked first, of all places at once: a loop without branches or gathers, which
+    the compiler turns into vector instructions. `between` (n, n) must be symmetric.
+    """
     k = len(way)
     total = 0.0
+    leg = np.zeros(k)  # from each node to the next; the end has none, so that it may be anywhere
+    for j in range(k - 1):
+        leg[j] = between[way[j], way[j + 1]]
+    here, there = np.zeros(k + 1), np.zeros(k + 1)
     for _ in range(_PASSES):
         gained = 0.0
-        # Reverse way[i..j]; the end is free.
+        # Reverse way[i..j]; `here` (k,) are the lengths from way[i - 1] to all, `there` those from way[i].
+        for j in range(k):
+            here[j] = between[way[0], way[j]]
         for i in range(1, k - 1):
-            for j in range(i + 1, k):
-                old = between[way[i - 1], way[i]]
-                new = between[way[i - 1], way[j]]
-                if j + 1 < k:
-                    old += between[way[j], way[j + 1]]
-                    new += between[way[i], way[j + 1]]
-                if new < old - 1e-9:
-                    gained += old - new
-                    a, b = i, j
-                    while a < b:
-                        way[a], way[b] = way[b], way[a]
-                        a += 1
-                        b -= 1
+            _lengths(way[i], way, between, there)
+            start = i + 1
+            while True:
+                last = leg[i - 1]
+                low = start & ~7  # few different lengths of the loop, which the processor can foresee
+                for j in range(low, start):
+                    here[j] = np.inf
+                hits = 0
+                for j in range(low, k):
+                    hits += here[j] + there[j + 1] < last + leg[j] - 1e-9
+                if hits == 0:
+                    break
+                j = start
+                while not here[j] + there[j + 1] < last + leg[j] - 1e-9:
+                    j += 1
+                gained += last + leg[j] - (here[j] + there[j + 1])
+                a, b = i, j
+                while a < b:
+                    way[a], way[b] = way[b], way[a]
+                    here[a], here[b] = here[b], here[a]
+                    a += 1
+                    b -= 1
+                for a in range(i - 1, min(j + 1, k - 1)):
+                    leg[a] = between[way[a], way[a + 1]]
+                _lengths(way[i], way, between, there)
+                start = j + 1
+            here, there = there, here
         # Move way[i] between way[j] and way[j + 1].
         for i in range(1, k):
             node = way[i]
-            out = between[way[i - 1], node]
+            out = leg[i - 1]
             if i + 1 < k:
-                out += between[node, way[i + 1]] - between[way[i - 1], way[i + 1]]
+                out += leg[i] - between[way[i - 1], way[i + 1]]
             best, at = out - 1e-9, -1
+            _lengths(node, way, between, here)
+            here[i] = np.inf  # not beside itself
+            hits = 0
             for j in range(k):
-                if j == i or j == i - 1:
-                    continue
-                add = between[way[j], node]
-                if j + 1 < k:
-                    add += between[node, way[j + 1]] - between[way[j], way[j + 1]]
+                hits += here[j] + (here[j + 1] - leg[j]) < best
+            if hits == 0:
+                continue
+            for j in range(k):
+                add = here[j] + (here[j + 1] - leg[j])
                 if add < best:
                     best, at = add, j
-            if at >= 0:
-                gained += out - best
-                if at < i:
-                    for a in range(i, at + 1, -1):
-                        way[a] = way[a - 1]
-                    way[at + 1] = node
-                else:
-                    for a in range(i, at):
-                        way[a] = way[a + 1]
-                    way[at] = node
+            gained += out - best
+            if at < i:
+                for a in range(i, at + 1, -1):
+                    way[a] = way[a - 1]
+                way[at + 1] = node
+            else:
+                for a in range(i, at):
+                    way[a] = way[a + 1]
+                way[at] = node
+            for a in range(min(at, i - 1), min(max(at, i) + 1, k - 1)):
+                leg[a] = between[way[a], way[a + 1]]
         total += gained
         if gained < 1e-9:
             break
     return total
+
+
+@njit(cache=True)
+def _lengths(node: int, way: np.ndarray, between: np.ndarray, out: np.ndarray) -> None:
+    """Lengths from a node to all of a way (k,), then 0: beyond its end there is nothing to reach."""
+    for j in range(len(way)):
+        out[j] = between[node, way[j]]
+    out[len(way)] = 0.0
 
 
 @njit(cache=True)
@@ -108,12 +147,12 @@ def group_tours(cost: np.ndarray, between: np.ndarray, group: np.ndarray) -> np.
 
     Args:
         cost: (k,) path lengths from the robot, m.
-        between: (k, k) path lengths between the nodes, m.
+        between: (k, k) path lengths between the nodes, m, symmetric.
         group: (k,) number of each node's group, 0 to g - 1.
     """
     k, g = len(cost), group.max() + 1
     out = np.empty(k)
-    way = np.empty(g, np.int64)
+    way = np.empty(g, np.uint16)
     reach, came = np.empty((g, k)), np.empty((g, k), np.int64)
     for first in range(k):
         left = np.ones(g, np.bool_)

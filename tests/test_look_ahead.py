@@ -7,7 +7,7 @@ import pytest
 
 from baselines import make_policy
 from baselines.rollout import played_out
-from baselines.tours import group_tours, tours
+from baselines.tours import group_tours, improve, tours
 from polyexplore_gym.cli import LOOK_AHEAD
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.env import PolyExploreEnv
@@ -35,6 +35,48 @@ def test_tours_beside_all_orders(k):
             assert best - 1e-9 <= tour[first] <= greedy[first] + 1e-9
             ratios.append(tour[first] / best)
     assert np.mean(ratios) < 1.02
+
+
+def shortened(way, between):
+    """2-opt and Or-opt moves until nothing helps, one comparison at a time: the way and the metres saved."""
+
+    def length(a, b):
+        return between[way[a], way[b]] if b < k else 0.0
+
+    way, k, total = list(way), len(way), 0.0
+    for _ in range(10):
+        gained = 0.0
+        for i in range(1, k - 1):
+            for j in range(i + 1, k):
+                saved = length(i - 1, i) + length(j, j + 1) - (length(i - 1, j) + length(i, j + 1))
+                if saved > 1e-9:
+                    gained += saved
+                    way[i : j + 1] = way[i : j + 1][::-1]
+        for i in range(1, k):
+            out = length(i - 1, i) + length(i, i + 1) - length(i - 1, i + 1)
+            more = {j: length(j, i) + length(i, j + 1) - length(j, j + 1)
+                    for j in range(k) if j not in (i - 1, i)}  # fmt: skip
+            j = min(more, key=more.__getitem__, default=i)
+            if j != i and more[j] < out - 1e-9:
+                gained += out - more[j]
+                node = way.pop(i)
+                way.insert(j if j > i else j + 1, node)
+        total += gained
+        if gained < 1e-9:
+            break
+    return way, total
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 9, 24, 40])
+def test_improve_beside_a_plain_loop(k):
+    rng = np.random.default_rng(k)
+    for _ in range(12 if k < 20 else 4):
+        _, between = scattered(rng, k)
+        way = rng.permutation(k)
+        expected, saved = shortened(way, between)
+        found = way.copy()
+        assert improve(found, between) == pytest.approx(saved, abs=1e-9)
+        assert found.tolist() == expected
 
 
 @pytest.mark.parametrize("groups", [1, 3, 5])
