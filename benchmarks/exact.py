@@ -84,7 +84,7 @@ class LeftOver:
         return self.area <= self.limit
 
 
-@njit(cache=True)
+@njit  # not cached: tests load this file under another name
 def _bearings(walls, x, y, reach):  # type: ignore[no-untyped-def]
     """Bearings (n,) at which the nearest wall may change: walls' ends, and where walls leave the range."""
     out, n = np.empty(4 * walls.shape[0]), 0
