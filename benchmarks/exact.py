@@ -271,13 +271,14 @@ def _best(places: np.ndarray, promise: np.ndarray, least: float, apart: float) -
 def check(env: PolyExploreEnv, *, sampled: bool = False) -> LeftOver:
     """`left_over` of the episode that an environment has played."""
     base: PolyExploreEnv = env.unwrapped  # type: ignore[assignment]
-    return left_over(
-        base.plan, base.snapshot().measured_at, base.config.sensor, base.config.robot.radius, sampled=sampled
-    )
+    scans = np.array(base._measured_at)  # as `snapshot().measured_at`, which also unites the scans' polygons: slow
+    return left_over(base.plan, scans, base.config.sensor, base.config.robot.radius, sampled=sampled)
 
 
-def play(env: PolyExploreEnv, policy: Any, seed: int, options: dict[str, Any] | None = None) -> tuple[str, int]:
-    """Play an episode: "ended" or "truncated", and the number of decisions."""
+def play(
+    env: PolyExploreEnv, policy: Any, seed: int, options: dict[str, Any] | None = None
+) -> tuple[str, int, dict[str, Any]]:
+    """Play an episode: "ended" or "truncated", the number of decisions, and the last info."""
     observation, info = env.reset(seed=seed, options=options)
     rng = np.random.default_rng(seed)
     if hasattr(policy, "reset"):
@@ -286,7 +287,7 @@ def play(env: PolyExploreEnv, policy: Any, seed: int, options: dict[str, Any] | 
     while info["action_mask"].any() and not truncated:
         observation, _, _, truncated, info = env.step(policy.act(observation, info, rng))
         decisions += 1
-    return ("truncated" if truncated else "ended"), decisions
+    return ("truncated" if truncated else "ended"), decisions, info
 
 
 def draw(env: PolyExploreEnv, found: LeftOver, file: Path) -> None:
@@ -358,7 +359,7 @@ def main() -> None:
     for file in options.plan:
         env = PolyExploreEnv(plan=load_plan(file), config=config)
         began = time.process_time()
-        outcome, decisions = play(env, load_policy(options.policy), options.seed)
+        outcome, decisions, _ = play(env, load_policy(options.policy), options.seed)
         played = time.process_time() - began
         found = check(env, sampled=options.sampled)
         seconds = time.process_time() - began - played

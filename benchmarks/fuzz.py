@@ -13,10 +13,10 @@ Findings: a crash (the process died), an exception, a hang (the CPU limit), a tr
 ended although a place within reach would show more floor that no scan saw than `exact.py` allows. With the pose from
 odometry, `slam` or a localiser with an error the map is off, so only the other checks count. How an end is wrong:
 
-    over at reset       no decision was made
     jump edge masked    a jump edge borders what is left: the map knows of it but finds no place or path
     jump edge lost      none does: the map takes what is left for seen, or for wall
-    behind a slit       what is left is nothing that the disc could drive over
+    over at reset       one of these, and no decision was made
+    behind a slit       what is left is mostly floor that the disc cannot drive over
     between beams       complete but for floor that only beams far apart could have seen (`exact.py`, sampled)
 
 `--scaled` plays each case twice, the second time with the plan and all configured lengths and speeds times a power of
@@ -53,6 +53,7 @@ from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError
 from polyexplore_gym.evaluation.policy import load_policy
 from polyexplore_gym.evaluation.tables import format_table
+from polyexplore_gym.exploration import shapes
 from polyexplore_gym.floorplan import FAMILIES, FloorPlan, generate
 
 CPU_LIMIT = 120
@@ -354,21 +355,20 @@ def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[
         config = from_mapping(EnvConfig, case.values)
         env = PolyExploreEnv(plan=case.plan, config=config)
         options = None if case.start is None else {"start": tuple(case.start)}
-        outcome, decisions = exact.play(env, load_policy(case.criterion), case.number, options)
+        outcome, decisions, info = exact.play(env, load_policy(case.criterion), case.number, options)
     except (InvalidConfigError, InvalidFloorPlanError) as error:
         return None, None, {**result, "kind": "refused", "error": f"{type(error).__name__}: {error}"}
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno} {where.name})"
         return None, None, {**result, "kind": "exception", "error": text[:400]}
-    snapshot = env.snapshot()
-    result |= {"decisions": decisions, "scans": len(snapshot.measured_at), "distance": round(snapshot.distance, 3),
+    result |= {"decisions": decisions, "scans": info["measurements"], "distance": round(info["distance"], 3),
                "seconds": round(time.process_time() - began, 2), "kind": outcome}  # fmt: skip
     if config.pose.mode != "exact":
         return env, None, result
     found = exact.check(env)
     result |= {"seen": round(100.0 * found.share, 2), "left": round(found.area / found.limit, 3),
-               "drivable": round(found.drivable / found.limit, 3), "open edges": len(snapshot.jump_edges),
+               "drivable": round(found.drivable / found.limit, 3), "open edges": len(env.exploration.chains),
                "place": None if found.place is None else [round(float(v), 3) for v in found.place]}  # fmt: skip
     if outcome == "ended":
         result["kind"] = _verdict(env, found, decisions, result)
@@ -379,13 +379,12 @@ def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[
 def _verdict(env: PolyExploreEnv, found: exact.LeftOver, decisions: int, result: dict[str, Any]) -> str:
     """In which way an end is wrong, if it is."""
     if not found.complete:
-        if decisions == 0:
-            return "over at reset"
-        if found.drivable <= found.limit:
+        if found.drivable <= 0.5 * found.area:
             return "behind a slit"
-        edges = [shapely.LineString(line) for line in env.snapshot().jump_edges]
+        edges = [shapely.LineString(line) for line in shapes.jump_edges(env.exploration)]
         near = min((float(found.shown.distance(edge)) for edge in edges), default=math.inf)
-        return "jump edge masked" if near < env.config.robot.radius else "jump edge lost"
+        kind = "jump edge masked" if near < env.config.robot.radius else "jump edge lost"
+        return kind if decisions else f"over at reset, {kind}"
     sampled = exact.check(env, sampled=True)
     result["left, sampled"] = round(sampled.area / sampled.limit, 3)
     return "complete" if sampled.complete else "between beams"

@@ -108,7 +108,7 @@ def test_worst_place_against_many_places(exact):
 
 def test_an_explored_plan_is_complete_also_between_beams(exact):
     env = PolyExploreEnv(plan=two_rooms(), config=EnvConfig(sensor=SensorConfig(field_of_view=2 * math.pi)))
-    outcome, decisions = exact.play(env, load_policy("nearest"), 0)
+    outcome, decisions, _ = exact.play(env, load_policy("nearest"), 0)
     assert outcome == "ended"
     assert decisions > 0
     for sampled in (False, True):
