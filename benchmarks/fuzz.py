@@ -56,7 +56,7 @@ from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.exploration import shapes
 from polyexplore_gym.floorplan import FAMILIES, FloorPlan, generate
 
-CPU_LIMIT = 120
+CPU_LIMIT = 60
 """CPU time of a case, s."""
 DECISIONS = 2000
 """Decisions of a case, then it is truncated: a finding."""
@@ -381,8 +381,10 @@ def _verdict(env: PolyExploreEnv, found: exact.LeftOver, decisions: int, result:
     if not found.complete:
         if found.drivable <= 0.5 * found.area:
             return "behind a slit"
+        parts = shapely.get_parts(found.unseen)
+        left = shapely.union_all(parts[shapely.intersects(parts, found.shown.buffer(-1e-3 * env.config.robot.radius))])
         edges = [shapely.LineString(line) for line in shapes.jump_edges(env.exploration)]
-        near = min((float(found.shown.distance(edge)) for edge in edges), default=math.inf)
+        near = min((float(left.distance(edge)) for edge in edges), default=math.inf)
         kind = "jump edge masked" if near < env.config.robot.radius else "jump edge lost"
         return kind if decisions else f"over at reset, {kind}"
     sampled = exact.check(env, sampled=True)
