@@ -169,10 +169,11 @@ class ExplorationConfig:
 
     placement: Literal["midpoint", "in_front"] = "midpoint"
     """Node on the middle of the jump edge (the paper), or in front of it on its known side (Ekman)."""
-    front_distance: float = 1.0
-    """in_front: distance of the node from the jump edge, m, less where the sampling condition asks for it."""
+    front_distance: float | None = None
+    """in_front: distance of the node from the jump edge, m, less where the sampling condition asks for it, and half the
+    sensor's range at most; None: four radii of the robot."""
     samples: int = 6
-    """in_front: fewest beams that must fall on the jump edge (DESIGN: 2 without noise, 6 with)."""
+    """in_front: fewest beams that must fall on the jump edge (Ekman: 2 without noise, 6 with)."""
     min_gap: float | None = None
     """Shortest jump edge of interest, m; None: the robot's diameter."""
     look_around: bool = True
@@ -185,7 +186,8 @@ class ExplorationConfig:
     def __post_init__(self) -> None:
         _require_finite(self)
         _require(self.placement in ("midpoint", "in_front"), self, "placement", "must be 'midpoint' or 'in_front'")
-        _require(self.front_distance > 0, self, "front_distance", "must be positive")
+        ok = self.front_distance is None or self.front_distance > 0
+        _require(ok, self, "front_distance", "must be positive or None")
         _require(self.samples >= 1, self, "samples", "must be at least 1")
         _require(self.min_gap is None or self.min_gap > 0, self, "min_gap", "must be positive or None")
         _require(self.scan_every == 0 or self.scan_every >= 0.1, self, "scan_every", "must be 0 or at least 0.1")
