@@ -145,12 +145,13 @@ class MappingConfig:
     """Make one of the lines of a scan that lie on one wall; False: keep all that the start finds (for comparison)."""
     min_points: int = 6
     """Fewest returns on a line."""
-    min_length: float = 0.25
-    """Shortest line, m."""
+    min_length: float | None = None
+    """Shortest line, m; None: half a door's width."""
     merge_gate: float = 9.21
     """Chi-square gate (2 degrees of freedom) of the merge test; the paper's 3 keeps only 78 % of true pairs."""
-    door_width: float = 0.5
-    """A gap along a line that is wider is not bridged, m."""
+    door_width: float | None = None
+    """A gap along a line that is wider is not bridged, m; None: the robot's diameter, without a robot 0.5. Lengths that
+    decide in the map (what covers, joins, is too short) are shares of it."""
     range_floor: float = 0.0
     """Smallest standard deviation of range assumed in the fit, m (real logs: 0.005 to 0.01)."""
 
@@ -158,9 +159,20 @@ class MappingConfig:
         _require_finite(self)
         _require(self.start in ("endpoint", "hough"), self, "start", "must be 'endpoint' or 'hough'")
         _require(self.min_points >= 3, self, "min_points", "must be at least 3")
-        for name in ("min_length", "merge_gate", "door_width"):
-            _require(getattr(self, name) > 0, self, name, "must be positive")
+        _require(self.merge_gate > 0, self, "merge_gate", "must be positive")
+        for name in ("min_length", "door_width"):
+            value = getattr(self, name)
+            _require(value is None or value > 0, self, name, "must be positive or None")
         _require(self.range_floor >= 0, self, "range_floor", "must not be negative")
+
+    def resolved(self, radius: float = 0.25) -> MappingConfig:
+        """The same with numbers for all that is None, for a robot of `radius` m."""
+        if self.door_width is not None and self.min_length is not None:
+            return self
+        door = 2.0 * radius if self.door_width is None else self.door_width
+        return dataclasses.replace(
+            self, door_width=door, min_length=0.5 * door if self.min_length is None else self.min_length
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

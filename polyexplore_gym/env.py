@@ -120,7 +120,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
         self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
-        self._lines = LineMap(c.mapping, c.sensor)
+        self._mapping = c.mapping.resolved(c.robot.radius)
+        self._lines = LineMap(self._mapping, c.sensor)
         self._localizer = Localizer() if c.pose.mode == "slam" else None
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
@@ -284,7 +285,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         assert self._world is not None
         laser = self._world.laser
         ranges = laser.measure(self._world.segments, pose, self._laser_rng)
-        found = extract_lines(laser.angles, ranges, self.config.sensor, self.config.mapping)
+        found = extract_lines(laser.angles, ranges, self.config.sensor, self._mapping)
         estimate, covariance = self._pose_model.measured(pose)
         if self._localizer is None:
             return ranges, found, Correction.none(estimate, covariance)

@@ -159,7 +159,7 @@ def _lines(which, segments, line, alpha, rho, covariance, frame, out):
         of = line[r]
         if of < 0:
             continue
-        # The line about the robot: DESIGN section 5 inverted, H = [[1, 0], [-dpsi, 1]].
+        # The line about the robot: `fit.to_map` inverted, H = [[1, 0], [-dpsi, 1]].
         ca = math.cos(alpha[of])
         sa = math.sin(alpha[of])
         shift = frame[0] * sa - frame[1] * ca

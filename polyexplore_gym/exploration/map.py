@@ -17,7 +17,7 @@ from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
 from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.exploration.scan_polygon import Scans
-from polyexplore_gym.exploration.tolerances import tolerances
+from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
 VISIT = 8
@@ -122,6 +122,9 @@ def _nothing() -> Opened:
     return Opened(i, z, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i)
 
 
+_EVERYWHERE = np.array([-math.inf, -math.inf, math.inf, math.inf])
+
+
 def _no_box() -> np.ndarray:
     return np.array([math.inf, math.inf, -math.inf, -math.inf])
 
@@ -148,13 +151,16 @@ class ExplorationMap:
         self._angles = np.zeros(n)
         self.pieces = Pieces.none()
         self.chains = JumpEdges.new(_nothing(), np.zeros(0, np.int64))
-        self.graph = PathGraph(self.tol)
+        self.graph = self._wide = PathGraph(self.tol)
+        self._tight: PathGraph | None = None
+        """Paths through passages that the noise closes: made when nothing else is in reach."""
+        self._tight_touched: list[np.ndarray] = []
         self.robot = -1
         self._start: list[tuple[float, float]] = []
         self._next_id = 0
         self._trail: list[np.ndarray] = []
         self._touched: list[np.ndarray] = []
-        self._felt: list[tuple[float, float, float]] = []
+        self._felt: list[tuple[float, float, float, float, float]] = []
         self._walls = np.zeros((0, 4))
         self._box = _no_box()
 
@@ -302,11 +308,19 @@ class ExplorationMap:
         r = self.tol.radius
         x, y = pose[0] + r * c, pose[1] + r * s
         half = 0.04 * r
-        for fx, fy, before in self._felt:
+        for fx, fy, before, _, _ in self._felt:
             if math.hypot(fx - x, fy - y) < 0.08 * r:
                 half = max(half, 2.0 * before)
-        self._felt.append((x, y, half))
-        self.graph.add_felt(np.array([x + half * s, y - half * c, x - half * s, y + half * c]))
+        self._felt.append((x, y, half, c, s))
+        for graph in (self._wide, self._tight):
+            if graph is not None:
+                self._put_felt(graph, x, y, half, c, s)
+
+    def _put_felt(self, graph: PathGraph, x: float, y: float, half: float, c: float, s: float) -> None:
+        # Felt walls stand where they are: no path may squeeze into them.
+        near = self.tol.need - graph.tol.need
+        x, y = x - near * c, y - near * s
+        graph.add_felt(np.array([x + half * s, y - half * c, x - half * s, y + half * c]))
 
     # Nodes and paths -------------------------------------------------------------------------
 
@@ -319,17 +333,67 @@ class ExplorationMap:
             self._trail.append(came)
         self._walls = walls[alive]
         touched = np.unique(np.concatenate(self._touched)) if self._touched else np.zeros(0, np.int64)
-        self._plan(pose, walls, alive, touched)
-        if not self.reachable.any() and self._look_again():
-            self._plan(pose, walls, alive, touched[:0])
+        self._switch(self._wide)
+        if self._touched:
+            self._show(self._wide, walls, alive, touched, self._box)
+        if self._tight is not None:
+            self._tight_touched.append(touched)
+        self._plan(pose)
+        while not self.reachable.any() and self.chains.count and not self._squeeze(pose, walls, alive):
+            self._switch(self._wide)
+            if not self._look_again():
+                self._plan(pose)
+                break
+            self._show(self._wide, walls, alive, touched[:0], _EVERYWHERE)
+            self._box = _EVERYWHERE
+            self._plan(pose)
         self._touched = []
         self._box = _no_box()
 
-    def _plan(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray, touched: np.ndarray) -> None:
+    def _show(
+        self, graph: PathGraph, walls: np.ndarray, alive: np.ndarray, touched: np.ndarray, box: np.ndarray
+    ) -> None:
+        """Let a path graph know what is new."""
+        graph.set_walls(walls, alive, touched, self.scans, box)
+        graph.set_pieces(self.pieces.segments, self.pieces.sigma, self.pieces.owner, box)
+
+    def _switch(self, graph: PathGraph) -> None:
+        """Use another path graph: all nodes are placed anew."""
+        if graph is self.graph:
+            return
+        self._drop_nodes(np.arange(self.chains.count))
+        if self.robot >= 0:
+            self.graph.remove_leaves(np.array([self.robot]))
+            self.robot = -1
+        self.graph = graph
+        self._box = _EVERYWHERE
+
+    def _squeeze(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> bool:
+        """Look for ways through passages that the noise of the map closes. Whether one leads to a node."""
+        if self._tight is None:
+            self._tight = PathGraph(squeezed(self.tol))
+            self._tight_touched = [np.arange(len(walls))]
+            for felt in self._felt:
+                self._put_felt(self._tight, *felt)
+        touched = np.unique(np.concatenate(self._tight_touched)) if self._tight_touched else np.zeros(0, np.int64)
+        self._switch(self._tight)
+        self._show(self._tight, self._shortened(walls), alive, touched, _EVERYWHERE)
+        self._tight_touched = []
+        self._plan(pose)
+        return bool(self.reachable.any())
+
+    def _shortened(self, walls: np.ndarray) -> np.ndarray:
+        """Walls (m, 4) less what noise may have added at their ends: where a wall is seen at a slant, several sigma."""
+        way = walls[:, 2:] - walls[:, :2]
+        length = np.hypot(*way.T)
+        less = min(6.0 * self.tol.sigma_range, 0.25 * self.tol.radius)
+        share = np.where(length > 3.0 * less, less / np.maximum(length, 1e-300), 0.0)[:, None]
+        return np.concatenate((walls[:, :2] + share * way, walls[:, 2:] - share * way), axis=1)
+
+    def _plan(self, pose: np.ndarray) -> None:
+        """Nodes, gains and paths in the current graph."""
         g, x, y = self.graph, float(pose[0]), float(pose[1])
         if self._touched:
-            g.set_walls(walls, alive, touched, self.scans, self._box)
-            g.set_pieces(self.pieces.segments, self.pieces.sigma, self.pieces.owner, self._box)
             g.add_way_point(x, y)
         if self.robot >= 0:
             g.remove_leaves(np.array([self.robot]))
@@ -363,8 +427,6 @@ class ExplorationMap:
         p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
         all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
         self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
-        self._box = np.array([-math.inf, -math.inf, math.inf, math.inf])
-        self._touched = [none]
         return self.chains.count > before or bool(again.any())
 
     def remains(self) -> Remains:
