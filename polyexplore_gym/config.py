@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 from polyexplore_gym.errors import InvalidConfigError
+from polyexplore_gym.presets import PRESETS
 
 LONGEST = 1e5
 """Bound of every range, and of every position and length in the observation, m."""
@@ -303,16 +304,40 @@ T = TypeVar("T")
 def from_mapping(cls: type[T], values: Mapping[str, Any], path: str = "config") -> T:
     """Build a config dataclass from nested mappings; unknown keys and wrong types raise.
 
+    That of an `EnvConfig` may hold `"preset": name` (see `preset`); its other fields go before those of the preset.
+
     Raises `InvalidConfigError` naming the full path of the offending field.
     """
     if not isinstance(values, Mapping):
         raise InvalidConfigError(f"{path}: expected a mapping, got {type(values).__name__}")
     hints = _hints(cls)  # type: ignore[arg-type]
+    if cls is EnvConfig and "preset" in values:
+        values = _with_preset(values, path)
     unknown = sorted(str(k) for k in values if k not in hints)
     if unknown:
         raise InvalidConfigError(f"{path}: unknown field {unknown[0]!r}; known: {', '.join(sorted(hints))}")
     kwargs = {key: _built(hints[key], value, f"{path}.{key}") for key, value in values.items()}
     return cls(**kwargs)
+
+
+def preset(name: str) -> EnvConfig:
+    """The configuration of a robot and its sensor by name: see `polyexplore_gym.presets`.
+
+    Raises `InvalidConfigError` listing the names if there is none of this one.
+    """
+    return from_mapping(EnvConfig, {"preset": name})
+
+
+def _with_preset(values: Mapping[str, Any], path: str) -> dict[str, Any]:
+    """The mapping with the fields of its preset filled in where it says nothing itself."""
+    rest = dict(values)
+    name = rest.pop("preset")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise InvalidConfigError(f"{path}.preset = {name!r}: unknown; known: {', '.join(PRESETS)}")
+    for part, fields in PRESETS[name].items():  # type: ignore[index]
+        given = rest.get(part, {})
+        rest[part] = {**fields, **given} if isinstance(given, Mapping) else given
+    return rest
 
 
 @functools.cache

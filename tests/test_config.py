@@ -5,6 +5,7 @@ import json
 import math
 import typing
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -20,11 +21,13 @@ from polyexplore_gym.config import (
     RobotConfig,
     SensorConfig,
     from_mapping,
+    preset,
     to_mapping,
 )
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidConfigError
-from polyexplore_gym.floorplan import FloorPlan
+from polyexplore_gym.floorplan import FloorPlan, generate
+from polyexplore_gym.presets import PRESETS, PresetName
 
 PARTS = [
     SensorConfig, RobotConfig, DriveConfig, PoseConfig, MappingConfig, ExplorationConfig, ObservationConfig,
@@ -143,3 +146,47 @@ def test_a_sensor_by_itself_may_be_any():
     """Logs come from all kinds of sensors; only to explore with, there must be something to see."""
     for values in ({"field_of_view": 0.01}, {"max_range": 0.05}, {"beams": 3}, {"sigma_angle": 0.3}):
         SensorConfig(**values)
+
+
+# Presets -------------------------------------------------------------------------------------------
+
+
+def test_presets_by_name_in_a_mapping_and_through_make():
+    assert typing.get_args(PresetName) == tuple(PRESETS)
+    assert preset("pioneer3dx") == EnvConfig()
+    burger = preset("turtlebot3")
+    assert (burger.sensor.beams, burger.sensor.max_range, burger.robot.radius) == (360, 3.5, 0.105)
+    mapped = from_mapping(
+        EnvConfig,
+        {"preset": "turtlebot3", "sensor": {"max_range": np.float32(3.0)}, "drive": DriveConfig(mode="kinematic")},
+    )
+    sensor = dataclasses.replace(burger.sensor, max_range=3.0)
+    assert mapped == dataclasses.replace(burger, sensor=sensor, drive=DriveConfig(mode="kinematic"))
+    whole = from_mapping(EnvConfig, {"preset": "turtlebot3", "sensor": SensorConfig()})
+    assert (whole.sensor, whole.robot) == (SensorConfig(), burger.robot)
+    for config in (burger, {"preset": "turtlebot3"}):
+        env = gym.make("polyexplore_gym:PolyExplore-Home-v0", config=config)
+        assert env.unwrapped.config == burger
+        assert gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped.config == burger
+    for name in ("r2d2", 3, None):
+        with pytest.raises(InvalidConfigError, match=rf"config\.preset = {name!r}: unknown; known: pioneer3dx, turtle"):
+            from_mapping(EnvConfig, {"preset": name})
+    with pytest.raises(InvalidConfigError, match=r"config\.sensor: unknown field 'preset'"):
+        from_mapping(EnvConfig, {"sensor": {"preset": "turtlebot3"}})
+    with pytest.raises(InvalidConfigError, match=r"config\.sensor: expected a mapping"):
+        from_mapping(EnvConfig, {"preset": "turtlebot3", "sensor": 3})
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_explore(name):
+    for mode in ("physics", "kinematic"):
+        env = PolyExploreEnv(generate("home", 0), config={"preset": name, "drive": {"mode": mode}})
+        observation, info = env.reset(seed=0)
+        seen = info["coverage"]
+        for _ in range(4):
+            valid = np.flatnonzero(info["action_mask"])
+            if len(valid):
+                observation, *_, info = env.step(int(valid[observation["node_path_length"][valid].argmin()]))
+        assert info["coverage"] > seen
+        assert info["distance"] > 0
+        assert info["sim_time"] > info["distance"] / env.config.robot.max_speed - 1e-6
