@@ -14,11 +14,11 @@ import numpy as np
 from gymnasium import spaces
 from numba import njit
 
-from polyexplore_gym.config import ObservationConfig
+from polyexplore_gym.config import LONGEST, ObservationConfig
 from polyexplore_gym.exploration import ExplorationMap
 from polyexplore_gym.mapping import LineMap
 
-LIMIT = 1e5
+LIMIT = LONGEST
 """Bound of every position and length, m; also the path length to what cannot be reached."""
 
 _VARIANCE = 1e6
@@ -87,7 +87,7 @@ def observe(
     arrays: dict[str, np.ndarray] = {key: np.zeros(shape, dtype) for key, shape, dtype in _layout(n, m)}
     arrays["pose"][:] = pose
     arrays["pose_covariance"][:] = np.clip(covariance, -_VARIANCE, _VARIANCE)
-    arrays["max_range"][:] = min(max_range, LIMIT)
+    arrays["max_range"][:] = max_range
     arrays["node_mask"][:k] = 1
     _nodes(
         rows, c.ends, c.node, c.path_length, c.length, c.gain, c.kind, c.visits, frame, arrays["edges"],
