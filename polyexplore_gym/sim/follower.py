@@ -18,9 +18,9 @@ from numba import njit
 
 from polyexplore_gym.sim.robot import BENDS, SKIN, nearest_wall, slide
 
-X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT = range(8)
-"""The state, float64 (8,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase, and
-motion lost to a wall (m, see `forget`)."""
+X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, MET = range(9)
+"""The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
+motion lost to a wall (m, see `forget`), and whether (0, 1) a wall has taken anything."""
 FOLLOW, ALIGN, FINAL, DONE, LOST, BUMP = range(6)
 """The phases: drive along the leg, turn on the spot towards it, turn to the final heading; then the drive has ended:
 arrived, off the path, held by a wall."""
@@ -35,6 +35,8 @@ _LOST = 2.0
 """Farther from its leg (radii) the robot is lost: a diameter, as far as a wall can push it and still let it return."""
 _LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.32, 1.4, 0.3
 """Look-ahead, shortest and longest in radii, and the way driven in so many seconds between."""
+_LOOK_STEPS = 2.0
+"""No nearer than so many steps: an error of heading then decays fastest; from one step on it would grow."""
 _TURN_SHARE = 0.4
 _MARGIN, _BACKWARD = 0.9, 0.8
 """Shares of the acceleration limits planned with when braking, and between corners; the rest is for corrections."""
@@ -177,6 +179,7 @@ def command(state, path, speeds, heading, final_turn, limits, body, step):  # ty
             state[PHASE] = ALIGN
             continue
         look = min(max(_LOOK_TIME * state[SPEED], _LOOK_MIN * radius), _LOOK_MAX * radius)
+        look = max(look, _LOOK_STEPS * state[SPEED] * step)
         tx, ty = _look_ahead(path, speeds, leg, max(along, 0.0), look)
         off = _wrap(math.atan2(ty - y, tx - x) - phi)
         curvature = 2.0 * math.sin(off) / max(math.hypot(tx - x, ty - y), 0.5 * look)
@@ -184,6 +187,8 @@ def command(state, path, speeds, heading, final_turn, limits, body, step):  # ty
         if curvature != 0.0:
             wish = min(wish, max_rate / abs(curvature))
         wish = min(wish, max_speed / (1.0 + 0.5 * track * abs(curvature)))
+        if abs(aside) > _CUT * radius:  # back to the leg in several steps
+            wish = min(wish, _LOOK_MAX * radius / (_LOOK_STEPS * step))
         # slow enough to turn towards the point before it is reached, as at the vertices
         wish = min(wish, 0.5 * look * math.sqrt(_TURN_SHARE * turn_acceleration / max(abs(off), 1e-6)))
         state[SPEED] = max(0.0, _towards(state[SPEED], wish, acceleration * step))
@@ -216,6 +221,7 @@ def _push(state, step, walls, radius, bends):  # type: ignore[no-untyped-def]
     lost = moved - progress
     if lost > _ROUNDING * moved:
         state[DEFICIT] += lost
+        state[MET] = 1.0
         state[SPEED] = max(0.0, progress / step)
     forget(state, progress)
     return n

@@ -43,7 +43,8 @@ class DriveResult:
     contact: float | None
     """Where on the rim a bump was felt: bearing in the robot frame, rad; None without a bump."""
     arrived: bool
-    """Whether the end of the path and the heading were reached; False after a bump or at the time limit."""
+    """Whether the end of the path and the heading were reached; False after a bump, at the time limit, or where a
+    robot that covers many of its lengths in a step could not keep to the path."""
 
 
 class World:
@@ -106,8 +107,8 @@ class World:
     def drive(self, path: np.ndarray, heading: float | None = None) -> DriveResult:
         """Drive along path (k, 2), k >= 1, true frame, from the robot's position; then turn to heading (rad), if any.
 
-        Raises `InvalidMotionError` for an array that is not finite (k, 2), a path that starts more than 0.4 % of the radius from
-        the robot, or a heading that is not finite.
+        Raises `InvalidMotionError` for an array that is not finite (k, 2), a path that starts more than 0.4 % of the
+        radius from the robot, or a heading that is not finite.
         """
         way = self._checked_path(path)
         final_turn = heading is not None
@@ -156,7 +157,7 @@ class World:
 
     def _follow(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
         robot, step = self.robot, self.config.time_step
-        state = np.zeros(8)
+        state = np.zeros(9)
         state[:3] = self._pose
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
         speeds = follower.vertex_speeds(path, self._limits, robot.radius)
@@ -184,10 +185,10 @@ class World:
         trajectory = np.concatenate(parts)
         trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
         self._pose = trajectory[-1].copy()
-        ended = state[follower.PHASE] >= follower.DONE
+        ended = state[follower.PHASE] >= follower.DONE and state[follower.MET] > 0.0
         away = math.hypot(self._pose[0] - path[-1, 0], self._pose[1] - path[-1, 1]) > _ARRIVED * robot.radius
         arrived = bool(state[follower.PHASE] == follower.DONE) and not away
-        collided = bool(ended and not arrived)  # nothing but a wall keeps the follower from its goal
+        collided = bool(ended and not arrived)
         return DriveResult(
             trajectory, float(way_length(trajectory)), done * step, collided, self._contact(collided), arrived
         )

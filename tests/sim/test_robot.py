@@ -32,10 +32,10 @@ def test_first_contact_agrees_with_shapely() -> None:
     rng, radius, hits = np.random.default_rng(1), 0.25, 0
     for _ in range(1500):
         walls = random_walls(rng, int(rng.integers(1, 25)), side=8.0)
-        start = clear_point(rng, walls, 5.0, radius + STANDOFF)
+        start = clear_point(rng, walls, 5.0, radius * (1 + STANDOFF))
         way = rng.uniform(-5, 5, 2)
         lines = lines_of(walls)
-        contact, stop = first_contact(walls, *start, *way, radius, STANDOFF)
+        contact, stop = first_contact(walls, *start, *way, radius, STANDOFF * radius)
         if contact == np.inf:
             assert shapely.distance(lines, shapely.linestrings([start, start + way])) >= radius - 2e-9
             continue
@@ -51,18 +51,18 @@ def test_first_contact_agrees_with_shapely() -> None:
         ]
         hit = walls[int(np.argmin(clearance))].reshape(2, 2)
         gap = shapely.distance(shapely.linestrings(hit), shapely.points(start + stop * way)) - radius
-        assert gap == pytest.approx(STANDOFF, abs=1e-7)
+        assert gap == pytest.approx(STANDOFF * radius, abs=1e-7)
     assert hits > 300
 
 
 def test_a_disc_that_touches_a_wall_may_leave_it_but_not_enter() -> None:
     wall = np.array([[-1.0, 0.0, 1.0, 0.0]])
     for height in (0.25, 0.2499):
-        assert first_contact(wall, 0.0, height, 0.3, -0.1, 0.25, STANDOFF) == pytest.approx((0.0, 0.0), abs=1e-6)
-        assert first_contact(wall, 0.0, height, 0.3, 0.1, 0.25, STANDOFF) == (np.inf, np.inf)
-        assert first_contact(wall, 0.0, height, 0.3, 0.0, 0.25, STANDOFF) == (np.inf, np.inf)
-    assert first_contact(wall, -3.0, 0.25, 6.0, 0.0, 0.25, STANDOFF)[0] == np.inf  # passes touching
-    assert first_contact(wall, 0.0, 1.0, 0.0, 0.0, 0.25, STANDOFF) == (np.inf, np.inf)
+        assert first_contact(wall, 0.0, height, 0.3, -0.1, 0.25, 1e-3) == pytest.approx((0.0, 0.0), abs=1e-6)
+        assert first_contact(wall, 0.0, height, 0.3, 0.1, 0.25, 1e-3) == (np.inf, np.inf)
+        assert first_contact(wall, 0.0, height, 0.3, 0.0, 0.25, 1e-3) == (np.inf, np.inf)
+    assert first_contact(wall, -3.0, 0.25, 6.0, 0.0, 0.25, 1e-3)[0] == np.inf  # passes touching
+    assert first_contact(wall, 0.0, 1.0, 0.0, 0.0, 0.25, 1e-3) == (np.inf, np.inf)
 
 
 @pytest.mark.parametrize(("distance", "speed", "acceleration"), [(4.0, 1.2, 0.6), (0.5, 1.2, 0.6), (2.4, 1.2, 0.6)])
