@@ -75,10 +75,10 @@ class Track(NamedTuple):
 class LaserLog:
     """The scans of a log: n scans, the k-th of b_k beams. All poses are those of the laser, mounting applied."""
 
-    angles: Sequence[np.ndarray]
+    angles: Sequence[np.ndarray] | np.ndarray
     """n arrays (b_k,) of beam angles in the laser's frame, rad, strictly increasing. Scans whose beams are alike share
     one array; a single array (b,) stands for all scans."""
-    ranges: Sequence[np.ndarray]
+    ranges: Sequence[np.ndarray] | np.ndarray
     """n arrays (b_k,), m; an array (n, b) does as well. inf: nothing within the maximum range, free as far as that.
     NaN: nothing is known about that beam."""
     poses: np.ndarray | None
@@ -88,7 +88,7 @@ class LaserLog:
     max_range: float | None = None
     """Range from which on a beam has no return, m, if the log gives it."""
     poses_are: Literal["corrected", "odometry", "unknown"] = "unknown"
-    """corrected by a SLAM program or a localiser; raw odometry, and then equal to `odometry`; or the log does not say."""
+    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; or the log does not say."""
     why: str = ""
     """How that is known: one sentence for the user."""
     odometry: np.ndarray | None = None
