@@ -647,7 +647,7 @@ def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
     points, lines = len(made.points), made.rho.size
     on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
     return (
-        f"{name}: {len(log.ranges)} scans of {log.angles.size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"{name}: {len(log)} scans of {log.angles[0].size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
         f"  points        {points} ({on_lines})\n"
         f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
         f"{len(made.fragments)} fragments\n"

@@ -7,6 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
+from polyexplore_gym.mapping.fit import normal_variance
+from polyexplore_gym.mapping.grouping import ATTACH
+
 OBLIQUE = 1.0 / math.cos(math.radians(70.0))  # neighbouring leftover returns are joined up to this incidence
 # Shares of a door's width:
 COARSEST = 0.4  # largest simplification tolerance
@@ -19,6 +22,33 @@ def lone(x: float, y: float, resolution: float, door: float, out: np.ndarray, co
     """Append a piece about the return (x, y), across its beam and as wide, to out. Returns the new count."""
     half = 0.5 * min(max(resolution, LEAST * door / math.hypot(x, y)), WIDEST * door / math.hypot(x, y))
     out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x + half * y, y - half * x, x - half * y, y + half * x
+    return count + 1
+
+
+@njit(cache=True)
+def beside(
+    x: float, y: float, resolution: float, fits: np.ndarray, var_range: float, var_angle: float, door: float,
+    out: np.ndarray, count: int,
+) -> int:  # fmt: skip
+    """As `lone`, but along the line on which the return lies, if there is one that the piece would stick out of.
+
+    On a line means within 3 sigma, and out of it farther than that: a wide piece, far off on an oblique wall.
+    """
+    d = math.hypot(x, y)
+    best, least, half = -1, ATTACH, 0.5 * min(max(resolution, LEAST * door / d), WIDEST * door / d)
+    for i in range(fits.shape[0]):
+        if fits[i, 8] == 0:
+            continue
+        ca, sa = math.cos(fits[i, 1]), math.sin(fits[i, 1])
+        e, out_of = x * ca + y * sa - fits[i, 0], half * (y * ca - x * sa)
+        variance = normal_variance(x, y, ca, sa, var_range, var_angle)
+        if e * e < least * variance and out_of * out_of > ATTACH * variance:
+            best, least = i, e * e / variance
+    if best < 0:
+        return lone(x, y, resolution, door, out, count)
+    half *= d
+    ux, uy = -half * math.sin(fits[best, 1]), half * math.cos(fits[best, 1])
+    out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x - ux, y - uy, x + ux, y + uy
     return count + 1
 
 
@@ -66,12 +96,17 @@ def fragment_chains(
     beam: np.ndarray,
     where: np.ndarray,
     resolution: float,
+    fits: np.ndarray,
     var_range: float,
     var_angle: float,
     door: float,
 ) -> np.ndarray:
-    """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width,
-    `WIDEST` at most. Returns a door's width apart are not joined."""
+    """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width, `WIDEST` at
+    most. Returns a door's width apart are not joined.
+
+    fits: (count, 9) of `grouping.fit_labels`. What lies on one of these lines, where returns are too far apart to be
+    its wall, gives a piece along it.
+    """
     m = x.size
     out = np.empty((m, 4))
     count = 0
@@ -88,7 +123,7 @@ def fragment_chains(
                 break
             stop += 1
         if stop == k:
-            count = lone(x[k], y[k], resolution, door, out, count)
+            count = beside(x[k], y[k], resolution, fits, var_range, var_angle, door, out, count)
         else:
             count = simplify(x, y, k, stop, var_range, var_angle, door, out, count)
         k = stop + 1
