@@ -19,6 +19,7 @@ import tyro
 
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+from polyexplore_gym.presets import PresetName
 
 if TYPE_CHECKING:
     from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
@@ -75,6 +76,8 @@ class Bench:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
     reference: str = "nearest"
@@ -101,6 +104,8 @@ class Run:
     """Where nodes are placed, instead of what the configuration says."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     gif: Path | None = None
@@ -173,6 +178,8 @@ class Eval:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
@@ -258,7 +265,7 @@ def evaluate_model(options: Eval) -> int:
             "--against: names of policies, of which none is 'learned': so the model is called here"
         )
     policies["learned"] = make_policy("learned", model=options.model)
-    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "config", "plots")
+    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "preset", "config", "plots")
     fields = {name: getattr(options, name) for name in same}
     return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
 
@@ -272,7 +279,7 @@ def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
-    config = _config(options.config, options.drive)
+    config = _config(options.config, options.preset, options.drive)
     study = Study(
         policies=policies,
         plans=list(_bench_plans(options, config)),
@@ -329,7 +336,7 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation.runner import make_env
 
     _check_run(options)
-    config = _config(options.config, options.drive, options.placement)
+    config = _config(options.config, options.preset, options.drive, options.placement)
     plan = _plan(options.plan)
     policy = load_policy(options.policy)
     env = make_env(config)
@@ -448,14 +455,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
 
 
-def _config(path: Path | None, drive: str | None, placement: str | None = None) -> EnvConfig:
-    config = EnvConfig()
+def _config(path: Path | None, preset: str | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+    values: Any = {}
     if path is not None:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InvalidConfigError(f"{path}: cannot be read: {error}") from error
-        config = from_mapping(EnvConfig, values, path=str(path))
+    if preset is not None and isinstance(values, dict):
+        values = {**values, "preset": preset}
+    config = from_mapping(EnvConfig, values, path=str(path or "config"))
     if drive is not None:
         config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
     if placement is not None:
@@ -638,7 +647,7 @@ def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
     points, lines = len(made.points), made.rho.size
     on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
     return (
-        f"{name}: {len(log.ranges)} scans of {log.angles.size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"{name}: {len(log)} scans of {log.angles[0].size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
         f"  points        {points} ({on_lines})\n"
         f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
         f"{len(made.fragments)} fragments\n"

@@ -20,7 +20,7 @@ from polyexplore_gym.floorplan import suite as suite_named
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
-from polyexplore_gym.sim.coverage import Coverage, grid_points
+from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
 from polyexplore_gym.sim.pose import PoseModel
 from polyexplore_gym.sim.world import World
 from polyexplore_gym.snapshot import Snapshot
@@ -29,8 +29,6 @@ WINDOW_FPS = 10.0
 """The window shows at most so many pictures a second."""
 WINDOW_STEP = 0.5
 """Way between two pictures of a drive in the window, m."""
-COVERAGE_GRID = 0.2
-"""Spacing of the sample points behind `info["coverage"]`, m."""
 
 
 class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
@@ -119,8 +117,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.plan = plan
         self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
-        self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
-        self._lines = LineMap(c.mapping, c.sensor)
+        self._coverage = Coverage(grid_points(plan.segments, grid_spacing(c.robot.radius, plan.area)))
+        self._mapping = c.mapping.resolved(c.robot.radius)
+        self._lines = LineMap(self._mapping, c.sensor)
         self._localizer = Localizer() if c.pose.mode == "slam" else None
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
@@ -284,7 +283,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         assert self._world is not None
         laser = self._world.laser
         ranges = laser.measure(self._world.segments, pose, self._laser_rng)
-        found = extract_lines(laser.angles, ranges, self.config.sensor, self.config.mapping)
+        found = extract_lines(laser.angles, ranges, self.config.sensor, self._mapping)
         estimate, covariance = self._pose_model.measured(pose)
         if self._localizer is None:
             return ranges, found, Correction.none(estimate, covariance)

@@ -150,11 +150,26 @@ def test_a_configuration_file(folder, tmp_path, capsys):
     assert main(["bench", *arguments, "--config", str(config), "--workers", "1", "--out", str(out)]) == 0
     assert read_manifest(out)["study"]["config"]["sensor"]["beams"] == 181
     assert {(r.placement, r.drive) for r in read_records(out)} == {("in_front", "kinematic")}
+    out = tmp_path / "preset"
+    command = ["bench", *arguments, "--preset", "turtlebot4", "--config", str(config), "--workers", "1"]
+    assert main([*command, "--out", str(out)]) == 0
+    kept = read_manifest(out)["study"]["config"]
+    assert (kept["sensor"]["beams"], kept["sensor"]["max_range"], kept["robot"]["radius"]) == (181, 12.0, 0.17)
     config.write_text(json.dumps({"sensor": {"beems": 181}}))
     assert main(["bench", *arguments, "--config", str(config)]) == 2
     error = capsys.readouterr().err
     assert "beems" in error
     assert "config.json.sensor" in error
+
+
+def test_a_robot_by_name(folder, capsys):
+    assert main(["run", str(folder / "rooms.json"), "--preset", "turtlebot3", "--drive", "kinematic"]) == 0
+    slow = capsys.readouterr().out
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    assert slow != capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["run", str(folder / "rooms.json"), "--preset", "r2d2"])
+    assert "turtlebot4" in capsys.readouterr().err
 
 
 def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):

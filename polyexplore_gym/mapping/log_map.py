@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
-from polyexplore_gym.errors import InvalidConfigError
+from polyexplore_gym.errors import InvalidConfigError, InvalidLogError
 from polyexplore_gym.mapping.evidence import confirmed, count, pieces_of
 from polyexplore_gym.mapping.extract import extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
@@ -73,10 +73,11 @@ def sensor_of(
     log: LaserLog, max_range: float | None = None, sigma_range: float = 0.01, sigma_angle: float = math.radians(0.1)
 ) -> SensorConfig:
     """The laser of a log. max_range (m): None for what the log says, else 30; the noise is in m and rad."""
-    span = float(log.angles[-1] - log.angles[0])
-    step = span / (log.angles.size - 1)
+    angles = max(log.angles, key=np.size)
+    span = float(angles[-1] - angles[0])
+    step = span / (angles.size - 1)
     return SensorConfig(
-        beams=log.angles.size,
+        beams=angles.size,
         # closed if the last beam neighbours the first
         field_of_view=2.0 * math.pi if span + 1.5 * step > 2.0 * math.pi else span,
         max_range=max_range if max_range is not None else log.max_range or MAX_RANGE,
@@ -123,6 +124,8 @@ def map_log(
         >>> map_log(log).segments.round(2) + 0.0
         array([[ 2.  , -1.09,  2.  ,  1.09]])
     """
+    if log.poses is None:
+        raise InvalidLogError("the log gives no poses")
     sensor = sensor_of(log) if sensor is None else sensor
     config = MappingConfig(range_floor=0.01) if config is None else config
     for name, value, least in (
@@ -139,11 +142,12 @@ def map_log(
     line_map, lines = LineMap(config, sensor), 0
     points, on_line = [], []
     for k in track(used, "lines"):
-        found = extract_lines(log.angles, log.ranges[k], sensor, config)
+        angles, ranges = log.angles[k], log.ranges[k]
+        found = extract_lines(angles, ranges, sensor, config)
         line_map.insert(found, log.poses[k], covariances[k])
         lines += found.rho.size
-        hit = log.ranges[k] < sensor.max_range
-        points.append(_placed(log.angles[hit], log.ranges[k, hit], log.poses[k]))
+        hit = ranges < sensor.max_range
+        points.append(_placed(angles[hit], ranges[hit], log.poses[k]))
         on_line.append(found.point_segment[hit] >= 0)
 
     rows = np.flatnonzero(line_map.alive)
@@ -156,7 +160,7 @@ def map_log(
         stopped, passed = np.zeros(begin[-1], np.int64), np.zeros(begin[-1], np.int64)
         noise = max(sensor.sigma_range, config.range_floor) ** 2, sensor.sigma_angle**2
         for k in track(used, "check"):
-            scan = log.angles, log.ranges[k], sensor.max_range, log.poses[k], covariances[k]
+            scan = log.angles[k], log.ranges[k], sensor.max_range, log.poses[k], covariances[k]
             count(whole, begin, *scan, *noise, stopped, passed)
         parts, of = confirmed(whole, begin, stopped, passed, ratio)
     intact = np.zeros(rows.size, bool)

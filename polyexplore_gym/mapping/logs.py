@@ -26,10 +26,10 @@ import math
 import re
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Literal, NamedTuple
 
 import numpy as np
 
@@ -62,24 +62,62 @@ class Broken(NamedTuple):
         return f"{self.where}: {self.reason}"
 
 
+class Track(NamedTuple):
+    """Poses over time, denser than the scans."""
+
+    times: np.ndarray
+    """(m,) s, increasing strictly."""
+    poses: np.ndarray
+    """(m, 3) x, y (m) and heading (rad) of the laser in the odometry frame."""
+
+
 @dataclass(frozen=True, slots=True)
 class LaserLog:
-    """The scans of a log: n scans of b beams."""
+    """The scans of a log: n scans, the k-th of b_k beams. All poses are those of the laser, mounting applied."""
 
-    angles: np.ndarray
-    """(b,) beam angles in the laser's frame, rad, strictly increasing."""
-    ranges: np.ndarray
-    """(n, b) ranges, m; inf where the log has less than 1e-6."""
-    poses: np.ndarray
-    """(n, 3) x, y (m) and heading (rad) of the laser in the map frame."""
+    angles: Sequence[np.ndarray] | np.ndarray
+    """n arrays (b_k,) of beam angles in the laser's frame, rad, strictly increasing. Scans whose beams are alike share
+    one array; a single array (b,) stands for all scans."""
+    ranges: Sequence[np.ndarray] | np.ndarray
+    """n arrays (b_k,), m; an array (n, b) does as well. inf: nothing within the maximum range, free as far as that.
+    NaN: nothing is known about that beam."""
+    poses: np.ndarray | None
+    """(n, 3) x, y (m) and heading (rad) in the map frame as the log gives them; `poses_are` says what they are."""
     pose_covariance: np.ndarray | None = None
     """(n, 3, 3) covariance of the poses, m2, m rad, rad2, if the log gives it."""
     max_range: float | None = None
     """Range from which on a beam has no return, m, if the log gives it."""
+    poses_are: Literal["corrected", "odometry", "unknown"] = "unknown"
+    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; or the log does not say."""
+    why: str = ""
+    """How that is known: one sentence for the user."""
+    odometry: np.ndarray | None = None
+    """(n, 3) pose by odometry alone when the scan was taken, in the odometry frame, if the log gives it."""
+    track: Track | None = None
+    """Odometry between the scans, if the log gives it with times."""
+    times: np.ndarray | None = None
+    """(n,) when the pose of each scan holds, s, not always increasing, if the log gives it."""
+    beam_times: Sequence[np.ndarray] | None = None
+    """n arrays (b_k,): when each beam was measured, s after `times`; None where a scan is taken at once."""
+    mount: np.ndarray | None = None
+    """(3,) x, y (m) and heading (rad) of the laser on the robot, if the log gives it. Applied already."""
     broken: tuple[Broken, ...] = ()
     """What was left out, in the order of the file."""
     unread: dict[str, int] = field(default_factory=dict)
-    """Scans in messages of another kind than the one read, by message."""
+    """Scans in messages of another kind than the one read, by message or topic."""
+
+    def __post_init__(self) -> None:
+        n = len(self.ranges)
+        if isinstance(self.angles, np.ndarray) and self.angles.ndim == 1:
+            object.__setattr__(self, "angles", (self.angles,) * n)
+        for name in ("angles", "ranges", "beam_times"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, tuple(value))
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.ranges)
 
 
 def read_log(
@@ -102,8 +140,8 @@ def read_log(
         >>> from polyexplore_gym.mapping import read_log
         >>> path = tempfile.mkdtemp() + "/scans.npz"
         >>> np.savez(path, angles=[-0.1, 0.0, 0.1], ranges=[[2.0, 2.0, 0.0]], poses=[[1.0, 0.0, 0.0]])
-        >>> read_log(path).ranges
-        array([[ 2.,  2., inf]])
+        >>> read_log(path).ranges[0]
+        array([ 2.,  2., inf])
     """
     path = Path(path)
     try:
