@@ -320,10 +320,10 @@ def case_of(number: int) -> Case:
         "robot": {"radius": radius, "track": 1.324 * radius, "max_speed": 1.2 * size, "max_acceleration": 0.6 * size},
         "drive": {"mode": str(rng.choice(["kinematic", "kinematic", "physics"]))},
         "pose": {"mode": str(rng.choice(["exact"] * 7 + ["gaussian", "odometry", "slam"]))},
-        "mapping": {"min_length": 0.25 * size, "door_width": 0.5 * size},
+        "mapping": {} if with_robot else {"min_length": 0.25, "door_width": 0.5},
         "exploration": {
             "placement": str(rng.choice(["in_front", "midpoint"])),
-            "front_distance": 1.0 * size,
+            "front_distance": None if with_robot else 1.0,
             "look_around": bool(rng.random() < 0.7),
             "scan_every": float(rng.choice([0.0, max(0.1, rng.uniform(0.5, 8.0) * radius)], p=[0.65, 0.35])),
         },
@@ -368,7 +368,7 @@ def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[
         return env, None, result
     found = exact.check(env)
     result |= {"seen": round(100.0 * found.share, 2), "left": round(found.area / found.limit, 3),
-               "drivable": round(found.drivable / found.limit, 3), "open edges": len(env.exploration.chains),
+               "drivable": round(found.drivable / found.limit, 3), "open edges": env.exploration.chains.count,
                "place": None if found.place is None else [round(float(v), 3) for v in found.place]}  # fmt: skip
     if outcome == "ended":
         result["kind"] = _verdict(env, found, decisions, result)
@@ -403,7 +403,8 @@ def describe(case: Case) -> dict[str, Any]:
         "fov": round(math.degrees(sensor["field_of_view"]), 1),
         "noise": round(sensor["sigma_angle"] / math.radians(0.1), 2), "drive": case.values["drive"]["mode"],
         "pose": case.values["pose"]["mode"], "placement": exploration["placement"],
-        "front/r": round(exploration["front_distance"] / radius, 1), "look_around": exploration["look_around"],
+        "front/r": round((exploration["front_distance"] or 4.0 * radius) / radius, 1),
+        "look_around": exploration["look_around"],
         "every/r": round(exploration["scan_every"] / radius, 2), "criterion": case.criterion,
         "start": "wall" if case.start else "",
     }  # fmt: skip
