@@ -56,15 +56,16 @@ from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.exploration import shapes
 from polyexplore_gym.floorplan import FAMILIES, FloorPlan, generate
 
-CPU_LIMIT = 60
-"""CPU time of a case, s."""
+CPU_LIMIT = 60.0
+"""CPU time of a case, s, and so much more for every 200 squares of the radius of its plan."""
 DECISIONS = 2000
-"""Decisions of a case, then it is truncated: a finding."""
+"""Decisions of a case, or one for every 20 squares of the radius: then it is truncated, a finding."""
 CRITERIA = ("nearest", "nearest", "nearest", "largest", "ekman_ratio", "modified_sum", "utility", "random")
 DOOR_OF_GENERATED = 0.3
 """Generated plans are connected for a disc of this radius, m."""
 _ATTEMPTS = 50
 _SAME = 1e-6
+_FIRST = 36
 _MARK = "fuzz:"
 
 
@@ -327,9 +328,9 @@ def case_of(number: int) -> Case:
             "look_around": bool(rng.random() < 0.7),
             "scan_every": float(rng.choice([0.0, max(0.1, rng.uniform(0.5, 8.0) * radius)], p=[0.65, 0.35])),
         },
-        "max_decisions": DECISIONS,
     }
     plan = plan_of(family, rng, radius, reach, f"case-{number}-{family.replace(' ', '-')}")
+    values["max_decisions"] = max(DECISIONS, int(plan.area / radius**2 / 20.0))
     start = _against_a_wall(rng, plan, radius) if rng.random() < 0.1 else None
     return Case(number=number, family=family, plan=plan, values=values, criterion=str(rng.choice(CRITERIA)),
                 start=start)  # fmt: skip
@@ -503,12 +504,15 @@ def serve(scale: bool) -> None:
     faulthandler.register(signal.SIGXCPU, chain=True)  # where it hangs, then the process ends
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    run(case_of(_FIRST))  # compiles the kernels
     for line in sys.stdin:
         number = int(line)
         used = resource.getrusage(resource.RUSAGE_SELF)
-        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime) + CPU_LIMIT, hard))
         try:
-            result = run_scaled(number) if scale else run(case_of(number))[2]
+            case = case_of(number)
+            limit = used.ru_utime + used.ru_stime + CPU_LIMIT + case.size / 200.0
+            resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(limit), hard))
+            result = run_scaled(number) if scale else run(case)[2]
         except Exception as error:  # of the fuzzer or of the check
             result = {"case": number, "kind": "fuzzer failed", "error": traceback.format_exc()[-600:] or str(error)}
         print(_MARK + json.dumps(result), flush=True)
