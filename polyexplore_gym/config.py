@@ -273,7 +273,7 @@ class PlanFileConfig:
     walls: Literal["outline", "areas", "lines"] = "outline"
     """Drawings: closed lines are the outline of the floor and of obstacles, or of walls, or lines are walls."""
     wall_thickness: float | None = None
-    """Thickness of lines that are walls, m: of GeoJSON (0: lines and points are left out), of drawings (default 0.1)."""
+    """Thickness of lines that are walls, m: of GeoJSON (0: they and points are left out), of drawings (default 0.1)."""
     layers: tuple[str, ...] = ()
     """Drawings: only what is on these layers or in these colours (names, DXF colour numbers, #rrggbb)."""
     doors: tuple[str, ...] = ()
@@ -289,7 +289,6 @@ class PlanFileConfig:
             value = getattr(self, name)
             ok = value is None or (isinstance(value, (int, float)) and math.isfinite(value) and least <= value <= 10.0)
             _require(ok, self, name, "must be a finite number of metres in 0 to 10")
-
 
 
 def from_mapping(cls: type[T], values: Mapping[str, Any], path: str = "config") -> T:

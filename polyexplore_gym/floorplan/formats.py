@@ -27,7 +27,7 @@ from polyexplore_gym.floorplan.validation import check_keys, shorten, to_array
 
 MAX_FILE_BYTES = 64 * 1024 * 1024
 """Largest JSON file or drawing read."""
-SUFFIXES = (".json", ".geojson", ".yaml", ".yml", ".dxf", ".svg")
+PLAN_SUFFIXES = (".json", ".geojson", ".yaml", ".yml", ".dxf", ".svg")
 """What `load_plan` reads and `save_plan` writes (.yml apart)."""
 _IMAGES = {".pgm", ".png", ".pnm", ".pbm", ".ppm", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff"}
 _PLAN_KEYS = ("name", "units", "exterior", "holes", "meta", "source")
@@ -96,8 +96,8 @@ def _load(path: Path, start: Sequence[float] | None, radius: float | None, optio
     suffix = path.suffix.lower()
     if suffix in _IMAGES:
         raise InvalidFloorPlanError("is an image; give the path of the map's yaml file, which names it")
-    if suffix not in SUFFIXES:
-        raise InvalidFloorPlanError(f"unknown suffix {path.suffix!r}; known: {', '.join(SUFFIXES)}")
+    if suffix not in PLAN_SUFFIXES:
+        raise InvalidFloorPlanError(f"unknown suffix {path.suffix!r}; known: {', '.join(PLAN_SUFFIXES)}")
     if suffix in (".yaml", ".yml"):
         from polyexplore_gym.floorplan.rosmap import load_ros_map
 
@@ -107,8 +107,7 @@ def _load(path: Path, start: Sequence[float] | None, radius: float | None, optio
     if suffix in (".dxf", ".svg"):
         from polyexplore_gym.floorplan.drawing import load_drawing
 
-        rooms, meta = load_drawing(path, options)
-        return _reached(rooms, path.stem, meta, path, start, radius, options)
+        return _reached(*load_drawing(path, options), path.stem, path, start, radius, options)
     data = _read_json(path)
     if not isinstance(data, Mapping):
         raise InvalidFloorPlanError(f"expected a JSON object, got {type(data).__name__}")
@@ -122,7 +121,7 @@ def _load(path: Path, start: Sequence[float] | None, radius: float | None, optio
         raise InvalidFloorPlanError(
             "not a floor plan: expected the key 'exterior' (plan), 'verts' (HouseExpo) or a GeoJSON 'type'"
         )
-    plan = _reached(rooms, name, meta, path, start, radius, options)
+    plan = _reached(rooms, meta, name, path, start, radius, options)
     x0, y0, x1, y1 = plan.bounds
     if plan.area > LARGE_AREA and not stated and (hint := guess(x1 - x0, y1 - y0)):
         warnings.warn(
@@ -136,8 +135,8 @@ def _load(path: Path, start: Sequence[float] | None, radius: float | None, optio
 
 def _reached(
     rooms: Sequence[shapely.Polygon],
-    name: str,
     meta: Mapping[str, Any],
+    name: str,
     path: Path,
     start: Sequence[float] | None,
     radius: float | None,
@@ -196,7 +195,7 @@ def save_plan(plan: FloorPlan, path: str | Path, *, resolution: float = 0.05) ->
 
         save_drawing(plan, path)
     else:
-        known = ", ".join(suffix for suffix in SUFFIXES if suffix != ".yml")
+        known = ", ".join(suffix for suffix in PLAN_SUFFIXES if suffix != ".yml")
         raise InvalidFloorPlanError(f"{path}: unknown suffix {path.suffix!r}; plans are written as {known}")
 
 

@@ -99,9 +99,7 @@ def read(data: Mapping[str, Any], *, units: object = None, wall_thickness: float
     if not isinstance(meta, Mapping):
         raise InvalidFloorPlanError(f"meta: expected an object, got {type(meta).__name__}")
     name = properties.get("name")
-    return Floor(
-        polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None
-    )
+    return Floor(polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None)
 
 
 def _collect(data: Any, properties: Mapping[str, Any], where: str, found: _Found) -> None:

@@ -182,6 +182,13 @@ class FloorPlan:
         inside = shapely.contains_xy(self.polygon, points[:, 0], points[:, 1])
         return np.where(inside, distance, -distance)
 
+    def covers(self, start: Any) -> bool:
+        """Whether the point x, y (m) lies in the plan; also True of what is no point, which `check_start` tells of."""
+        try:
+            return bool(shapely.intersects_xy(self.polygon, float(start[0]), float(start[1])))
+        except (TypeError, ValueError, IndexError, KeyError):
+            return True
+
     def sample_start(self, rng: np.random.Generator, radius: float, margin: float = 0.1) -> np.ndarray:
         """A random start pose (3,): x, y (m), heading (rad).
 

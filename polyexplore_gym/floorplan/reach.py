@@ -173,12 +173,13 @@ def _loss(
         return keeps_most([part.area for part in stands(step)])
 
     near, far = shapely.ops.nearest_points(main, away)
+    step = last_true(reaches)
     return Loss(
         kept=kept.area / sum(polygon.area for polygon in floor),
         area=kept.area,
         largest=largest.area,
         at=(target.x, target.y),
-        passage=2 * last_true(reaches) / STEPS * disc,
+        passage=2 * (step + 0.5) / STEPS * disc if step else 0.0,
         passage_at=((near.x + far.x) / 2, (near.y + far.y) / 2),
         radius=last_true(keeps) / STEPS * disc / PASSABLE,
     )

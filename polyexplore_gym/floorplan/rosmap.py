@@ -119,7 +119,7 @@ def save_ros_map(plan: FloorPlan, path: Path, resolution: float = RESOLUTION) ->
         )
     corner = np.array([x0, y0]) - 2 * resolution
     image = _drawn(plan, corner, resolution, (height, width))
-    write_map(path, image, resolution, corner, name=plan.name)
+    write_map(path, image, resolution, (float(corner[0]), float(corner[1])), name=plan.name)
 
 
 def write_map(path: Path, image: np.ndarray, resolution: float, corner: Sequence[float], *, name: str) -> None:
@@ -130,7 +130,7 @@ def write_map(path: Path, image: np.ndarray, resolution: float, corner: Sequence
     comment = "".join(character if character.isprintable() else " " for character in name)
     text = (
         f"# {comment}\nimage: {json.dumps(pgm.name)}\nmode: trinary\nresolution: {resolution!r}\n"
-        f"origin: [{float(corner[0])!r}, {float(corner[1])!r}, 0.0]\nnegate: 0\n"
+        f"origin: [{corner[0]!r}, {corner[1]!r}, 0.0]\nnegate: 0\n"
         f"occupied_thresh: {_DEFAULTS['occupied_thresh']}\nfree_thresh: {_DEFAULTS['free_thresh']}\n"
     )
     path.write_text(text, encoding="utf-8")
@@ -330,7 +330,10 @@ def _region(
     fine = 2 if part.size <= _FINE else 1
     disc = PASSABLE * radius / grid.resolution
     inner = None if seed is None else (seed[0] - top, seed[1] - left)
-    reached = Reached(part, disc, inner, fine)
+    try:
+        reached = Reached(part, disc, inner, fine)
+    except InvalidFloorPlanError as error:
+        raise InvalidFloorPlanError(f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)") from error
     region = np.zeros_like(free)
     region[top:bottom, left:right] = reached.region
     kept, total = int(reached.region.sum()), int(part.sum())
@@ -393,8 +396,11 @@ class Reached:
         region = clean
         if disc > 0:
             padded = np.pad(np.kron(clean, np.ones((fine, fine), bool)) if fine > 1 else clean, 1).astype(np.uint8)
-            # Distance from a pixel's centre to the nearest blocked pixel's edge, to about half a (fine) pixel.
-            self._distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
+            # From a pixel's centre to the nearest blocked pixel's edge. Halves of pixels make every straight passage
+            # an even number wide, whose middle is half of one off: there this gives the passage its true width, and a
+            # little too much elsewhere, where the outline decides.
+            edge = 0.5 if fine == 1 else 0.0
+            self._distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - edge
             centres = self._main(self._distance >= disc * fine)
             if centres is None:
                 raise InvalidFloorPlanError(f"no room for a disc of {disc:.1f} pixels in the free space")
@@ -453,7 +459,7 @@ class Reached:
         return _LostPixels(
             largest,
             at,
-            step / STEPS * self._disc,
+            (step + 0.5) / STEPS * self._disc if step else 0.0,
             self._stopped((row, column), (step + 1) / STEPS),
             last_true(lambda step: shares(step)[1]) / STEPS * self._disc,
         )
