@@ -644,7 +644,12 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
         f"{percent} % after " + (f"{d:.1f} m" if d is not None else "- (never)")
         for percent, d in ((90, record.distance_90), (95, record.distance_95), (99, record.distance_99))
     ]
-    status = record.status if record.error is None else f"failed: {record.error}"
+    left = (
+        ("out of reach", record.unreached, record.unreached_length),
+        ("given up", record.given_up, record.given_up_length),
+    )
+    told = [f"{n} jump edges ({length:.1f} m) {what}" for what, n, length in left if n]
+    status = ", ".join([record.status if record.error is None else f"failed: {record.error}", *told])
     return (
         f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
         f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"

@@ -137,7 +137,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._path = self._pose_model.estimate[None, :2]
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
         self._observe()
-        info = self._info(StepOutcome(), invalid=False)
+        info = self._info(StepOutcome(), invalid=False, truncated=False)
         if self.render_mode == "human":
             self.render()
         return self._observation(), info
@@ -171,9 +171,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             invalid_action=float(choice and not valid),
         )
         self._completed = terminated
-        info = self._info(outcome, invalid=not valid)
-        reward = float(sum(info["rewards"].values()))
         truncated = not terminated and self._decisions >= self.config.max_decisions
+        info = self._info(outcome, invalid=not valid, truncated=truncated)
+        reward = float(sum(info["rewards"].values()))
         if scene is not None:
             self._show_motion(scene, node if valid else None)
         return self._observation(), reward, terminated, truncated, info
@@ -333,7 +333,12 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """The observation, the caller's own to change."""
         return {key: value.copy() for key, value in self._observed.arrays.items()}
 
-    def _info(self, outcome: StepOutcome, *, invalid: bool) -> dict[str, Any]:
+    def _outcome(self, truncated: bool) -> dict[str, Any]:
+        """How the episode stands, and which jump edges (number and metres) it leaves."""
+        status = "budget" if truncated else "running" if self._observed.arrays["action_mask"].any() else "complete"
+        return {"status": status, "unreached": 0, "unreached_length": 0.0, "given_up": 0, "given_up_length": 0.0}
+
+    def _info(self, outcome: StepOutcome, *, invalid: bool, truncated: bool) -> dict[str, Any]:
         return {
             "action_mask": self._observed.arrays["action_mask"].copy(),
             "distance": self._distance,
@@ -345,6 +350,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             "path": tuple(map(tuple, self._path.tolist())),
             "rewards": rewards(outcome, self.config.reward),
             "invalid_action": invalid,
+            "outcome": self._outcome(truncated),
             "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
         }
 
