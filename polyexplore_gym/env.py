@@ -14,7 +14,7 @@ from gymnasium import spaces
 from polyexplore_gym import observation
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
-from polyexplore_gym.exploration import ExplorationMap
+from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
 from polyexplore_gym.floorplan import suite as suite_named
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
@@ -335,8 +335,11 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
 
     def _outcome(self, truncated: bool) -> dict[str, Any]:
         """How the episode stands, and which jump edges (number and metres) it leaves."""
-        status = "budget" if truncated else "running" if self._observed.arrays["action_mask"].any() else "complete"
-        return {"status": status, "unreached": 0, "unreached_length": 0.0, "given_up": 0, "given_up_length": 0.0}
+        if not truncated and self._observed.arrays["action_mask"].any():
+            return {"status": "running", **Remains(0, 0.0, 0, 0.0)._asdict()}
+        left = self._exploration.remains()
+        status = "budget" if truncated else "unreached" if left.unreached or left.given_up else "complete"
+        return {"status": status, **left._asdict()}
 
     def _info(self, outcome: StepOutcome, *, invalid: bool, truncated: bool) -> dict[str, Any]:
         return {
