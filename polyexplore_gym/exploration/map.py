@@ -310,7 +310,7 @@ class ExplorationMap:
         half = 0.04 * r
         for fx, fy, before, _, _ in self._felt:
             if math.hypot(fx - x, fy - y) < 0.08 * r:
-                half = max(half, 2.0 * before)
+                half = max(half, min(2.0 * before, r))
         self._felt.append((x, y, half, c, s))
         for graph in (self._wide, self._tight):
             if graph is not None:
@@ -453,12 +453,16 @@ class ExplorationMap:
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
         points, driven = [(x, y)], [0.0]
+        grain = 1.0 / self.tol.same_point
+        been = {(round(x * grain), round(y * grain)): 0}
         for px, py in itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail)):
-            been = [math.dist((px, py), p) < self.tol.same_point for p in points]
-            if any(been):
-                first = been.index(True)
+            spot = round(px * grain), round(py * grain)
+            if spot in been:  # a loop: it led back here
+                first = been[spot]
+                been = {s: k for s, k in been.items() if k <= first} if first < len(points) - 1 else been
                 del points[first + 1 :], driven[first + 1 :]
                 continue
+            been[spot] = len(points)
             driven.append(driven[-1] + math.dist((px, py), points[-1]))
             points.append((px, py))
             if self.graph.clearance(px, py) >= self.tol.need or driven[-1] > self.tol.back:
