@@ -315,6 +315,36 @@ class EnvConfig:
 T = TypeVar("T")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanFileConfig:
+    """How a file of a floor plan is read."""
+
+    units: str | None = None
+    """Units of a .json, .geojson, .dxf or .svg: m, cm, mm, in, ft, a number (metres a unit), or deg (GeoJSON only);
+    instead of what the file says."""
+    tolerance: float | None = None
+    """Greatest deviation by simplification of a robot map, m (default: a pixel), and of a drawing's curves (0.01)."""
+    walls: Literal["outline", "areas", "lines"] = "outline"
+    """Drawings: closed lines are the outline of the floor and of obstacles, or of walls, or lines are walls."""
+    wall_thickness: float | None = None
+    """Thickness of lines that are walls, m: of GeoJSON (0: they and points are left out), of drawings (default 0.1)."""
+    layers: tuple[str, ...] = ()
+    """Drawings: only what is on these layers or in these colours (names, DXF colour numbers, #rrggbb)."""
+    doors: tuple[str, ...] = ()
+    """Drawings: layers or colours of doors, which are opened."""
+    snap: float = 0.01
+    """Drawings: ends of lines closer than this meet, m."""
+    strict: bool = False
+    """Refuse a plan of which a part must be left out since the robot cannot reach it."""
+
+    def __post_init__(self) -> None:
+        _require(self.walls in ("outline", "areas", "lines"), self, "walls", "must be outline, areas or lines")
+        for name, least in (("tolerance", 0.0), ("wall_thickness", 0.0), ("snap", 0.0)):
+            value = getattr(self, name)
+            ok = value is None or (isinstance(value, (int, float)) and math.isfinite(value) and least <= value <= 10.0)
+            _require(ok, self, name, "must be a finite number of metres in 0 to 10")
+
+
 def from_mapping(cls: type[T], values: Mapping[str, Any], path: str = "config") -> T:
     """Build a config dataclass from nested mappings; unknown keys and wrong types raise.
 

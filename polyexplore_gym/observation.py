@@ -79,8 +79,8 @@ def observe(
     """Observe the state of the maps from the estimated `pose` (3,) with `covariance` (3, 3)."""
     n, m = config.max_nodes, config.max_lines
     c = exploration.chains
-    rows = np.arange(c.count)
-    if c.count > n:
+    rows = np.arange(c.size)
+    if c.size > n:
         rows = np.sort(np.lexsort((rows, c.path_length))[:n])
     k = len(rows)
     frame = pose if config.relative else np.zeros(3)
@@ -103,7 +103,7 @@ def observe(
         which = np.flatnonzero(lines.alive)[which]
     arrays["line_mask"][: len(which)] = 1
     _lines(which, lines.segments, lines.line, lines.alpha, lines.rho, lines.covariance, frame, arrays["lines"])
-    return Observed(arrays, rows, c.count - k, cut_lines)
+    return Observed(arrays, rows, c.size - k, cut_lines)
 
 
 @functools.cache

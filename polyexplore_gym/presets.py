@@ -60,7 +60,7 @@ PRESETS: dict[PresetName, Mapping[str, Mapping[str, Any]]] = {
         },
     },
     # SICK LMS111 (270 degrees in steps of 0.5, 20 m; 12 mm, taken as 20 mm and 1 mrad on a vehicle that shakes) on a
-    # transporter of 0.58 m width such as the MiR100 (1.5 m/s, 70 kg; wheels and accelerations: its ROS driver).
+    # transporter of 0.58 m width such as the MiR100 (1.5 m/s, 70 kg; wheels, turns and accelerations: its ROS package).
     "agv_lms111": {
         "sensor": {
             "beams": 541, "field_of_view": math.radians(270.0), "max_range": 20.0, "sigma_range": 0.02,

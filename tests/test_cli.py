@@ -68,7 +68,7 @@ def test_a_folder_is_compared(folder, tmp_path, capsys):
     assert "2 plans x 2 starts x 2 placements x 2 policies = 16 episodes" in captured.err
     records = read_records(out)
     assert len(records) == 16
-    assert {r.status for r in records} == {"complete"}
+    assert all(r.ended for r in records)
     assert {r.drive for r in records} == {"kinematic"}
     assert {r.plan for r in records} == {"rooms", "small"}
     assert {p["name"] for p in read_manifest(out)["study"]["plans"]} == {"rooms", "small"}
@@ -160,6 +160,16 @@ def test_a_configuration_file(folder, tmp_path, capsys):
     error = capsys.readouterr().err
     assert "beems" in error
     assert "config.json.sensor" in error
+
+
+def test_what_is_left_is_told(folder, capsys, monkeypatch):
+    from polyexplore_gym.env import PolyExploreEnv
+
+    left = {"status": "unreached", "unreached": 3, "unreached_length": 2.5, "given_up": 1, "given_up_length": 0.75}
+    monkeypatch.setattr(PolyExploreEnv, "_outcome", lambda self, truncated: left)
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    told = capsys.readouterr().out.splitlines()[0]
+    assert told.endswith("kinematic: unreached, 3 jump edges (2.5 m) out of reach, 1 jump edges (0.8 m) given up")
 
 
 def test_a_robot_by_name(folder, capsys):

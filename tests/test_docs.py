@@ -87,6 +87,18 @@ def test_the_first_loop_is_short_and_ends():
     assert "node_path_length" in PYTHON[0]
 
 
+def test_the_first_loop_works_on_a_plan_seen_whole_from_the_start(tmp_path, monkeypatch, capsys):
+    import gymnasium
+
+    from polyexplore_gym.floorplan import FloorPlan
+
+    room = FloorPlan.create([[0, 0], [3, 0], [3, 3], [0, 3]])
+    config = {"sensor": {"field_of_view": 2 * math.pi, "beams": 720}}
+    monkeypatch.setattr(gymnasium, "make", lambda *_, **__: PolyExploreEnv(room, config=config))
+    exec(compile(PYTHON[0], "README", "exec"), {})
+    assert capsys.readouterr().out == "0.0 m driven, 100.0 % seen\n"
+
+
 def test_there_is_something_to_test():
     assert len(PYTHON) >= 6
     assert {arguments(command)[0] for command in COMMANDS} == set(cli._COMMANDS)

@@ -27,19 +27,32 @@ ALLOWED = {
     "scan": set(),
     "snapshot": set(),
     "rewards": {"config"},
-    "floorplan": {"config"},
+    "optional": set(),
+    "floorplan": {"config", "optional"},
     "sim": {"config"},
     "mapping": {"config"},
     "exploration": {"config", "scan"},
     "observation": {"config", "exploration", "mapping"},
-    "animation": {"snapshot"},
-    "rendering": {"animation", "snapshot"},
+    "animation": {"optional", "snapshot"},
+    "rendering": {"animation", "optional", "snapshot"},
     "env": {
         "config", "exploration", "floorplan", "mapping", "observation", "rendering", "rewards", "scan", "sim",
         "snapshot",
     },
 }  # fmt: skip
-HEAVY = {"matplotlib", "pygame", "torch", "cv2", "stable_baselines3", "sb3_contrib", "imageio", "PIL", "ray", "jinja2"}
+HEAVY = {
+    "matplotlib",
+    "pygame",
+    "torch",
+    "cv2",
+    "stable_baselines3",
+    "sb3_contrib",
+    "imageio",
+    "PIL",
+    "ray",
+    "jinja2",
+    "ezdxf",
+}
 SCRIPTED = (
     "choice", "distance_advantage", "ekman_ratio", "largest", "modified_sum", "nearest", "pockets", "rollout", "tour",
     "tours", "uniform", "utility", "watchman",

@@ -91,7 +91,7 @@ class JumpEdges(NamedTuple):
         )  # fmt: skip
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """How many there are."""
         return len(self.id)
 
@@ -310,7 +310,7 @@ class ExplorationMap:
         half = 0.04 * r
         for fx, fy, before, _, _ in self._felt:
             if math.hypot(fx - x, fy - y) < 0.08 * r:
-                half = max(half, 2.0 * before)
+                half = max(half, min(2.0 * before, r))
         self._felt.append((x, y, half, c, s))
         for graph in (self._wide, self._tight):
             if graph is not None:
@@ -339,7 +339,7 @@ class ExplorationMap:
         if self._tight is not None:
             self._tight_touched.append(touched)
         self._plan(pose)
-        while not self.reachable.any() and self.chains.count and not self._squeeze(pose, walls, alive):
+        while not self.reachable.any() and self.chains.size and not self._squeeze(pose, walls, alive):
             self._switch(self._wide)
             if not self._look_again():
                 self._plan(pose)
@@ -361,7 +361,7 @@ class ExplorationMap:
         """Use another path graph: all nodes are placed anew."""
         if graph is self.graph:
             return
-        self._drop_nodes(np.arange(self.chains.count))
+        self._drop_nodes(np.arange(self.chains.size))
         if self.robot >= 0:
             self.graph.remove_leaves(np.array([self.robot]))
             self.robot = -1
@@ -404,14 +404,14 @@ class ExplorationMap:
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
         self._place(np.flatnonzero(local))
         self._update_paths()
-        if c.count and not self.reachable.any() and self._trail:
+        if c.size and not self.reachable.any() and self._trail:
             g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step), self.robot)
             self._update_paths()
             local[:] = True
         self._place_within(np.flatnonzero(local & ~self.reachable))
         if not self.reachable.any():
             # What is left lies behind slivers of the unknown: look at it across them.
-            self._place_within(np.arange(c.count), through_unknown=True)
+            self._place_within(np.arange(c.size), through_unknown=True)
         nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.tol, c.gain)
         g.recycle()
 
@@ -423,11 +423,11 @@ class ExplorationMap:
         if not (slits or again.any()):
             return False
         self.least_width = min(self.least_width, self.tol.slit)
-        before = self.chains.count
+        before = self.chains.size
         p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
         all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
         self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
-        return self.chains.count > before or bool(again.any())
+        return self.chains.size > before or bool(again.any())
 
     def remains(self) -> Remains:
         """The jump edges that are left: out of reach, and given up."""
@@ -453,12 +453,16 @@ class ExplorationMap:
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
         points, driven = [(x, y)], [0.0]
+        grain = 1.0 / self.tol.same_point
+        been = {(round(x * grain), round(y * grain)): 0}
         for px, py in itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail)):
-            been = [math.dist((px, py), p) < self.tol.same_point for p in points]
-            if any(been):
-                first = been.index(True)
+            spot = round(px * grain), round(py * grain)
+            if spot in been:  # a loop: it led back here
+                first = been[spot]
+                been = {s: k for s, k in been.items() if k <= first} if first < len(points) - 1 else been
                 del points[first + 1 :], driven[first + 1 :]
                 continue
+            been[spot] = len(points)
             driven.append(driven[-1] + math.dist((px, py), points[-1]))
             points.append((px, py))
             if self.graph.clearance(px, py) >= self.tol.need or driven[-1] > self.tol.back:

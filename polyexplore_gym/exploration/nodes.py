@@ -42,9 +42,10 @@ def point_along(rows, pieces, fraction):
 
 
 @njit(cache=True)
-def stands(x, y, mx, my, chain, walls, pieces, tol):
-    """Whether the disc may stand at (x, y) and the point (mx, my) of its jump edge is in sight."""
-    if clearance(x, y, walls, tol.reach) < tol.stand:
+def stands(x, y, mx, my, chain, walls, pieces, room, tol):
+    """Whether the disc may stand at (x, y), with clearance `room`, and the point (mx, my) of its jump edge is in
+    sight."""
+    if clearance(x, y, walls, tol.reach) < room:
         return False
     if norm(mx - x, my - y) < tol.sight:
         return True
@@ -78,7 +79,7 @@ def place(which, edges, front, walls, pieces, tol):
         d = min(front, edges.length[i] / (tol.samples * tol.step))
         x = mx - d * nx
         y = my - d * ny
-        if stands(x, y, mx, my, edges.id[i], walls, pieces, tol):
+        if stands(x, y, mx, my, edges.id[i], walls, pieces, tol.stand, tol):
             outcome[k] = 2
             out[k, 0] = x
             out[k, 1] = y
@@ -132,9 +133,9 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
             px, py = point_along(rows, pieces.segments, fraction)
             x = px - offset * tol.radius * nx
             y = py - offset * tol.radius * ny
-            if looked_from(x, y, px, py, scans, tol):
+            if looked_from(x, y, px + tol.aside * nx, py + tol.aside * ny, scans, tol):
                 continue
-            if stands(x, y, px, py, chain, walls, pieces, tol) and _joins(
+            if stands(x, y, px, py, chain, walls, pieces, tol.need, tol) and _joins(
                 x, y, chain, vertices, seen, walls, pieces, tol
             ):
                 return x, y, math.atan2(ny, nx), True
@@ -156,15 +157,16 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
             visible = crossing_free(vx, vy, tx, ty, walls, -2, -2, 0.0, tol.sight)
         else:
             # Only from the known side is the edge a window into the unknown.
-            visible = (mx - vx) * nx + (my - vy) * ny > 0.1 * d and sees(
+            ahead = (mx - vx) * nx + (my - vy) * ny
+            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(
                 vx, vy, tx, ty, walls, pieces, chain, chain, tol
             )
-        if visible and not looked_from(vx, vy, tx, ty, scans, tol):
+        if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, scans, tol):
             best = d
             bx = vx
             by = vy
             found = True
-    return bx, by, math.atan2(my - by, mx - bx), found
+    return bx, by, math.atan2(my + tol.aside * ny - by, mx + tol.aside * nx - bx), found
 
 
 @njit(cache=True)

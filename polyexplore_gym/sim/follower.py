@@ -236,7 +236,7 @@ def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, 
     done); it ends early when the phase is `DONE` or later, when the trajectory is full, and before a step that might
     leave the box.
     """
-    radius, track = body
+    radius, _track = body
     bends = np.empty((BENDS, 2))
     clear = 0.0  # at least so far to the nearest wall
     row = 0
