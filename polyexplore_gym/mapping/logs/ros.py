@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -143,12 +144,9 @@ class _Found:
 def _messages(reader: Any, wanted: list[Any], found: _Found) -> Iterator[tuple[str, float, Any]]:
     """Topic, time of recording (s) and message; what cannot be decoded is broken."""
     from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     first = isinstance(reader, Reader1)
-    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
-    for kind in TRANSFORMS:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    store = _typestore(first)
     for c in wanted:
         if first and c.digest and c.digest != store.generate_msgdef(c.msgtype)[1]:
             raise InvalidLogError(f"topic {c.topic}: its {c.msgtype} has another definition than that of ROS 1")
@@ -170,6 +168,17 @@ def _messages(reader: Any, wanted: list[Any], found: _Found) -> Iterator[tuple[s
             found.broken.append(Broken(where, f"cannot be decoded: {_reason(error)}"))
             continue
         yield connection.topic, 1e-9 * time, message
+
+
+@cache
+def _typestore(first: bool) -> Any:
+    """The message definitions of ROS 1 or ROS 2; those in a bag are not needed."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+    for kind in TRANSFORMS:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    return store
 
 
 def _add(topic: str, recorded: float, message: Any, found: _Found) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from polyexplore_gym.errors import InvalidLogError
 from polyexplore_gym.mapping.logs.poses import between
 from polyexplore_gym.mapping.logs.record import FARTHEST, Track
-from polyexplore_gym.mapping.logs.trajectory import UNIT, covered, heading
+from polyexplore_gym.mapping.logs.trajectory import UNIT, covered
 
 MOST_TILT = math.radians(20.0)
 """A laser that is tilted more does not scan a floor plan, rad."""
@@ -36,7 +36,7 @@ class Edge:
     def sorted(self) -> tuple[np.ndarray, np.ndarray]:
         """Times (m,), increasing, and transforms (m, 7) whose quaternions do not change sign."""
         times, first = np.unique(self.times, return_index=True)
-        values = np.array(self.values)[first]
+        values = np.array(self.values, np.float64)[first]
         turned = (values[1:, 3:] * values[:-1, 3:]).sum(axis=1) < 0
         values[1:, 3:] *= np.where(np.cumsum(turned) % 2 == 1, -1.0, 1.0)[:, None]
         return times, values
@@ -44,7 +44,8 @@ class Edge:
     def plane(self) -> Track:
         """The transforms in the plane."""
         times, values = self.sorted()
-        return Track(times, np.array([(*v[:2], heading(*v[3:])) for v in values.tolist()]))
+        turn = _rotations(values[:, 3:])
+        return Track(times, np.column_stack([values[:, :2], np.arctan2(turn[:, 1, 0], turn[:, 0, 0])]))
 
     def moves(self) -> bool:
         """Whether the transform changes at all."""

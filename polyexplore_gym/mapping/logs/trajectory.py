@@ -74,12 +74,8 @@ def _row(fields: list[str]) -> tuple[float, float, float, float]:
     length = math.hypot(*quaternion)
     if abs(length - 1.0) > UNIT:
         raise ValueError(f"the quaternion has the length {length:g}, not 1")
-    return time, x, y, heading(*quaternion)
-
-
-def heading(x: float, y: float, z: float, w: float) -> float:
-    """Rotation about the vertical axis of a unit quaternion, rad."""
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    qx, qy, qz, qw = quaternion
+    return time, x, y, math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
 
 
 def with_trajectory(log: LaserLog, trajectory: Track, name: str) -> LaserLog:
