@@ -93,11 +93,10 @@ class Bag:
         self.writer.write(self.connections[topic], round((START + time) * 1e9), encode(message, kind))
 
     def rotation(self, turn, upside_down=False):
-        half = 0.5 * turn
+        with np.errstate(invalid="ignore"):
+            c, s = np.cos(0.5 * turn), np.sin(0.5 * turn)
         # heading after a roll of pi: the laser hangs upside down
-        values = (
-            (math.cos(half), math.sin(half), 0.0, 0.0) if upside_down else (0.0, 0.0, math.sin(half), math.cos(half))
-        )
+        values = (c, s, 0.0, 0.0) if upside_down else (0.0, 0.0, s, c)
         return self.make("geometry_msgs/msg/Quaternion", *map(float, values))
 
     def transform(self, time, parent, child, pose, upside_down=False):

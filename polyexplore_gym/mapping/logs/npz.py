@@ -19,7 +19,15 @@ import numpy as np
 
 from polyexplore_gym.errors import InvalidLogError
 from polyexplore_gym.mapping.extract import LEAST_RANGE, increasing
-from polyexplore_gym.mapping.logs.record import FARTHEST, LEAST_BEAMS, MOST_BEAMS, WIDEST, Broken, LaserLog
+from polyexplore_gym.mapping.logs.record import (
+    FARTHEST,
+    LEAST_BEAMS,
+    LONGEST_RANGE,
+    MOST_BEAMS,
+    WIDEST,
+    Broken,
+    LaserLog,
+)
 
 KEYS = ("angles", "ranges", "poses", "max_range", "pose_covariance", "odometry", "times", "time_increment")
 LONGEST = 2.0
@@ -119,6 +127,6 @@ def _covariances(given: np.ndarray, n: int) -> np.ndarray:
 def _max_range(given: np.ndarray | None) -> float | None:
     if given is None:
         return None
-    if given.size != 1 or not (math.isfinite(given.item()) and given.item() > 0):
-        raise InvalidLogError("max_range: must be one positive number")
+    if given.size != 1 or not 0 < given.item() <= LONGEST_RANGE:
+        raise InvalidLogError(f"max_range: must be one number, positive and at most {LONGEST_RANGE:g} m")
     return given.item()

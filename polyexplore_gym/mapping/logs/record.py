@@ -14,6 +14,8 @@ MOST_BEAMS = 100_000
 """Most beams of a scan."""
 WIDEST = 2.0 * np.pi + 0.1
 """Widest field of view, rad: a full turn, and what a step that was rounded, or beams at the seam, may add."""
+LONGEST_RANGE = 1e4
+"""No laser measures farther, m."""
 FARTHEST = 1e8
 """A pose farther from the origin is garbage, m."""
 

@@ -24,7 +24,7 @@ import numpy as np
 from polyexplore_gym.errors import InvalidLogError, MissingDependencyError
 from polyexplore_gym.mapping.extract import LEAST_RANGE, increasing
 from polyexplore_gym.mapping.logs.npz import LONGEST
-from polyexplore_gym.mapping.logs.record import LEAST_BEAMS, MOST_BEAMS, WIDEST, Broken, LaserLog, Track
+from polyexplore_gym.mapping.logs.record import LEAST_BEAMS, LONGEST_RANGE, MOST_BEAMS, WIDEST, Broken, LaserLog, Track
 from polyexplore_gym.mapping.logs.tf import Frames
 from polyexplore_gym.mapping.logs.trajectory import chosen
 
@@ -54,7 +54,7 @@ def read_bag(path: Path, magic: bytes, topic: str | None, watch: Callable[[int],
         except InvalidLogError:
             raise
         except Exception as error:  # damaged files make rosbags raise many kinds
-            raise InvalidLogError(f"not a readable bag: {_reason(error)}") from error
+            raise InvalidLogError(f"not a readable bag: {_reason(error)}{_remedy(path, error)}") from error
         found.topic, found.unread = _topic(connections, topic)
         wanted = [c for c in connections if c.topic == found.topic or c.msgtype in (*TRANSFORMS, ODOMETRY)]
         size = path.stat().st_size if path.is_file() else sum(f.stat().st_size for f in path.iterdir() if f.is_file())
@@ -62,6 +62,9 @@ def read_bag(path: Path, magic: bytes, topic: str | None, watch: Callable[[int],
             if watch is not None and done % 64 == 0:
                 watch(int(size * min(done / max(total, 1), 1.0)))
             _add(*message, found)
+        for name, count in _announced(wanted).items():
+            if found.counts[name] < count:
+                found.broken.append(Broken(name, f"{found.counts[name]} messages of {count} are there"))
     if watch is not None:
         watch(size)
     return _log(found)
@@ -92,15 +95,29 @@ def _reader(path: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "damaged: a length in it makes no sense"
     return str(error).strip().rstrip(".") or type(error).__name__
+
+
+def _remedy(path: Path, error: Exception) -> str:
+    """What may help with a bag whose recording was cut off."""
+    if "index" in str(error):
+        return f"; rosbag reindex {path.name} may help"
+    return f"; mcap recover {path.name} may help" if "end magic" in str(error) else ""
+
+
+def _announced(connections: list[Any]) -> Counter[str]:
+    """How many messages the bag is said to hold, by topic."""
+    counts: Counter[str] = Counter()
+    for connection in connections:
+        counts[connection.topic] += connection.msgcount or 0
+    return counts
 
 
 def _topic(connections: list[Any], topic: str | None) -> tuple[str, dict[str, int]]:
     """The topic of the scans to read, and the number of messages in the others."""
-    counts: Counter[str] = Counter()
-    for connection in connections:
-        if connection.msgtype in SCANS:
-            counts[connection.topic] += connection.msgcount or 0
+    counts = _announced([connection for connection in connections if connection.msgtype in SCANS])
     there = ", ".join(sorted({f"{c.topic} ({c.msgtype})" for c in connections})) or "none"
     if not counts:
         raise InvalidLogError(f"no topic of laser scans; the topics are: {there}")
@@ -222,7 +239,8 @@ def _add_scan(message: Any, recorded: float, where: str, found: _Found) -> str:
     if message.__msgtype__ == SCANS[1]:
         ranges = np.array([echo.echoes[0] if len(echo.echoes) else math.nan for echo in message.ranges], np.float64)
     else:
-        ranges = np.asarray(message.ranges, np.float64)
+        with np.errstate(invalid="ignore"):  # NaN of all kinds
+            ranges = np.asarray(message.ranges, np.float64)
     start, step, size = float(message.angle_min), float(message.angle_increment), ranges.size
     if not LEAST_BEAMS <= size <= MOST_BEAMS:
         return f"{size} ranges; a scan has {LEAST_BEAMS} to {MOST_BEAMS}"
@@ -235,7 +253,7 @@ def _add_scan(message: Any, recorded: float, where: str, found: _Found) -> str:
         found.notes[f"time_increment {pause:g} s makes no sense: scans are taken as made at once"] = None
         pause = 0.0
     low, high = float(message.range_min), float(message.range_max)
-    high = high if 0.0 < high < math.inf else math.inf
+    high = high if 0.0 < high <= LONGEST_RANGE else math.inf
     finite = np.isfinite(ranges)
     free = ranges >= (1.0 - EQUAL) * high
     unknown = ~(ranges >= max(low if math.isfinite(low) else 0.0, LEAST_RANGE))
