@@ -116,7 +116,7 @@ def _points(kind: str, entity: Any, tolerance: float) -> tuple[np.ndarray, bool]
     if kind == "LWPOLYLINE" and not entity.has_arc:
         line = np.array([point[:2] for point in entity.get_points("xy")], dtype=np.float64).reshape(-1, 2)
     elif kind == "LINE":
-        line = np.array([entity.dxf.start[:2], entity.dxf.end[:2]], dtype=np.float64)
+        line = np.array([(point.x, point.y) for point in (entity.dxf.start, entity.dxf.end)], dtype=np.float64)
     else:
         path = make_path(entity)
         flat = path.flattening(max(tolerance, 1e-9)) if len(path) else []

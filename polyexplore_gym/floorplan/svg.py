@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -112,7 +113,9 @@ def _shapes(root: ElementTree.Element) -> Iterator[_Shape]:
         where = f"{tag} {element.get('id')!r}" if element.get("id") else tag
         if element.get("transform"):
             try:
-                matrix = matrix @ np.asarray(parse_transform(element.get("transform")), dtype=np.float64)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")  # svgpathtools only warns of transforms that it does not know
+                    matrix = matrix @ np.asarray(parse_transform(element.get("transform")), dtype=np.float64)
             except Exception as error:
                 raise InvalidFloorPlanError(f"{where}: transform {shorten(element.get('transform'))}") from error
         own = {element.get(key) for key in (_LABEL, "id")} | set(element.get("class", "").split())

@@ -113,7 +113,10 @@ def test_houseexpo(tmp_path):
         ("[" * 100_000, "not valid JSON"),
         (geometry([]), "list of rings"),
         (geometry(None), "'coordinates' must be a list"),
-        (geometry([[closed(RING)], [closed(RING)]], "MultiPolygon"), "MultiPolygon 1 covers the same floor as MultiPolygon 0"),
+        (
+            geometry([[closed(RING)], [closed(RING)]], "MultiPolygon"),
+            "MultiPolygon 1 covers the same floor as MultiPolygon 0",
+        ),
         (geometry([0, 0], "Point"), "no polygon"),
         ({"type": []}, "not a floor plan"),
         ({"type": "Feature", "geometry": {"type": [[]]}}, "unknown type"),

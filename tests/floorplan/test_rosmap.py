@@ -55,7 +55,9 @@ def test_largest_region_or_that_with_the_start(tmp_path):
     image[5:35, 5:65] = 254
     image[5:35, 70:95] = 254
     path = write_map(tmp_path, image)
-    with pytest.warns(FloorPlanWarning, match=r"reaches 71 % of the floor \(4.5 m2\); the largest part left out, 1.9 m2"):
+    with pytest.warns(
+        FloorPlanWarning, match=r"reaches 71 % of the floor \(4.5 m2\); the largest part left out, 1.9 m2"
+    ):
         assert load_plan(path).area == pytest.approx(60 * 30 * 0.05**2)
     with pytest.warns(FloorPlanWarning, match="reaches 29 % .*is not connected with it"):
         assert load_plan(path, start=(4.0, 1.0)).area == pytest.approx(25 * 30 * 0.05**2)
