@@ -175,7 +175,8 @@ def _rings(strokes: Sequence[Stroke], snap: float) -> list[shapely.Polygon]:
             x, y = ring[0]
             reason = str(error).removeprefix("exterior").lstrip(", :")
             raise InvalidFloorPlanError(f"the closed line that begins at ({x:.3f}, {y:.3f}): {reason}") from error
-    return found
+    # Lines that were drawn twice count once.
+    return list({shapely.normalize(ring).wkb: ring for ring in found}.values())
 
 
 def _chains(lines: Sequence[np.ndarray], snap: float) -> list[np.ndarray]:

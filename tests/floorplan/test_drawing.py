@@ -117,6 +117,15 @@ def two_rooms(space, gap):
         ring(space, box(3.9, 2 + gap, 4.1, 4.9))
 
 
+def test_lines_drawn_twice_count_once(dxf):
+    def draw(space, _):
+        for _ in range(2):
+            ring(space, box(0, 0, 8, 5))
+            ring(space, box(2, 2, 3, 3)[::-1])
+
+    assert_same(load_plan(dxf(draw)), shapely.box(0, 0, 8, 5) - shapely.box(2, 2, 3, 3))
+
+
 def test_walls_as_areas(dxf):
     plan = load_plan(dxf(lambda space, _: two_rooms(space, 1.0)), walls="areas")
     solid = shapely.box(3.9, 0.1, 4.1, 2) | shapely.box(3.9, 3, 4.1, 4.9)
