@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,19 +46,43 @@ def read(path: Path, units: str | None, tolerance: float) -> Drawing:
         file.seek(-min(64, path.stat().st_size), os.SEEK_END)
         if b"EOF" not in file.read():
             raise InvalidFloorPlanError("not a DXF drawing, or truncated: it does not end with EOF")
+    said: list[str] = []
     try:
-        document = ezdxf.readfile(path)
-        factor = _factor(document, units)
-        strokes, names, others = _strokes(document, factor, tolerance)
+        with _listening(said):
+            document = ezdxf.readfile(path)
+            factor = _factor(document, units)
+            strokes, names, others = _strokes(document, factor, tolerance)
     except InvalidFloorPlanError:
         raise
     except Exception as error:  # ezdxf lets through what damaged files make Python's own calls raise
         reason = " ".join(str(error).split())[:200]
         raise InvalidFloorPlanError(f"not a DXF drawing, or damaged: {reason or type(error).__name__}") from error
+    if said:
+        more = f" and {len(said) - 3} more" if len(said) > 3 else ""
+        warnings.warn(f"{path}: damaged in part: {'; '.join(said[:3])}{more}", FloorPlanWarning, stacklevel=2)
     if others:
         shown = ", ".join(f"{count} {kind[:40]}" for kind, count in sorted(others.items())[:8])
         warnings.warn(f"{path}: not read: {shown}", FloorPlanWarning, stacklevel=2)
     return Drawing(strokes, frozenset(names))
+
+
+@contextmanager
+def _listening(said: list[str]) -> Iterator[None]:
+    """Collect what ezdxf logs of entities that it leaves out, instead of printing it."""
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            said.append(" ".join(record.getMessage().split())[:120])
+
+    logger = logging.getLogger("ezdxf")
+    ear, passed_on = Ear(logging.WARNING), logger.propagate
+    logger.addHandler(ear)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(ear)
+        logger.propagate = passed_on
 
 
 def _factor(document: Any, units: str | None) -> float:

@@ -673,7 +673,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     origin = data["origin"]
     if not isinstance(origin, list) or len(origin) not in (2, 3):
         raise InvalidFloorPlanError(f"origin {shorten(origin)}: expected [x, y, yaw]")
-    fields["origin"] = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    x, y, yaw = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    if abs(yaw) > 2 * math.pi:
+        raise InvalidFloorPlanError(f"origin {shorten(origin)}: the yaw is in radians, so at most 2 pi")
+    fields["origin"] = (x, y, yaw)
     return fields
 
 
