@@ -217,7 +217,7 @@ def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
         if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
             want = blocked_want[e] - tol.still
             keep[e] = not _hit(ax, ay, bx, by, norm(bx - ax, by - ay), want, walls, discs)
-    for u in range(n_vertices):
+    for u in range(n_vertices if walls.shape[0] > 0 else 0):
         if links.degree[u] == 0:
             continue
         ax = position[u, 0]

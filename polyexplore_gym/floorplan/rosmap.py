@@ -333,8 +333,9 @@ def _region(
     try:
         reached = Reached(part, disc, inner, fine)
     except InvalidFloorPlanError as error:
-        reason = f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
-        raise InvalidFloorPlanError(reason) from error
+        raise InvalidFloorPlanError(
+            f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
+        ) from error
     region = np.zeros_like(free)
     region[top:bottom, left:right] = reached.region
     kept, total = int(reached.region.sum()), int(part.sum())
@@ -564,9 +565,18 @@ def _deepest(region: np.ndarray, grid: _Grid) -> tuple[float, float]:
 
 
 def _simplify(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
-    """Douglas-Peucker that keeps the rings apart, and all of them; pixels."""
+    """Douglas-Peucker that keeps the rings apart, and all of them, small obstacles as they are; pixels."""
+    if not tolerance:
+        return polygon
     # A small factor over a whole pixel: a staircase of single pixels becomes a straight line.
-    return shapely.simplify(polygon, 1.001 * tolerance, preserve_topology=True) if tolerance else polygon
+    simple = shapely.simplify(polygon, 1.001 * tolerance, preserve_topology=True)
+    x0, y0, x1, y1 = shapely.bounds(shapely.get_rings(polygon)[1:]).T
+    small = np.maximum(x1 - x0, y1 - y0) <= 3 * tolerance
+    if small.any() and len(simple.interiors) == len(small):
+        rings = zip(small, polygon.interiors, simple.interiors, strict=True)
+        whole = shapely.Polygon(simple.exterior, [before if keep else after for keep, before, after in rings])
+        return whole if whole.is_valid else simple
+    return simple
 
 
 def _too_many(outline: shapely.Polygon, count: int, tolerance: float, resolution: float) -> str:
@@ -663,7 +673,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     origin = data["origin"]
     if not isinstance(origin, list) or len(origin) not in (2, 3):
         raise InvalidFloorPlanError(f"origin {shorten(origin)}: expected [x, y, yaw]")
-    fields["origin"] = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    x, y, yaw = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    if abs(yaw) > 2 * math.pi:
+        raise InvalidFloorPlanError(f"origin {shorten(origin)}: the yaw is in radians, so at most 2 pi")
+    fields["origin"] = (x, y, yaw)
     return fields
 
 
