@@ -173,6 +173,18 @@ def test_scans_without_a_transform_at_their_time_are_left_out(tmp_path):
     assert_poses(log.poses, compose(odometry(log.times - START), MOUNT))
 
 
+def test_a_frame_of_two_parents_is_told_of(tmp_path):
+    with Bag(tmp_path / "a", "mcap") as bag:
+        bag.tf(0, bag.transform(0, "base_link", "laser", MOUNT), topic="/tf_static")
+        for time in np.arange(0, 1, 0.1):
+            bag.tf(time, bag.transform(time, "odom", "base_link", odometry(time)))
+            bag.tf(time, bag.transform(time, "other", "base_link", (0, 0, 0)))
+            bag.scan(time, measured(time))
+    log = read_log(bag.path)
+    assert log.notes == ("/tf gives base_link several parents: odom is used",)
+    assert_poses(log.poses, compose(odometry(0.1 * np.arange(10)), MOUNT))
+
+
 def test_the_topic_is_found_or_named(tmp_path):
     with Bag(tmp_path / "a", "mcap") as bag:
         for time in np.arange(0, 3, 0.1):

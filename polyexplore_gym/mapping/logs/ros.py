@@ -347,6 +347,9 @@ def _where(found: _Found, frame: str, times: np.ndarray) -> _Where:
     out = _Where(known=np.ones(times.size, bool))
     topic = _join_odometry(found, frame)
     chain = frames.above(frame)
+    for name in chain:
+        if frames.others[name]:
+            found.notes[f"/tf gives {name} several parents: {frames.edges[name].parent} is used"] = None
     fixed = 0
     while fixed + 1 < len(chain) and not frames.edges[chain[fixed]].moves():
         fixed += 1
