@@ -393,3 +393,24 @@ def test_real_logs(path):
     assert made.median_distance < 0.02
     assert made.on_line.mean() > 0.65
     assert made.misfit < 0.5 * MISFIT
+
+
+CASES = DATA.parent / "cases" / "reports"
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no reports of cases beside the checkout")
+@pytest.mark.parametrize(
+    ("name", "scans", "walls"),
+    [
+        ("l07b_reversed.log", 11, 5), ("l08a_nan.npz", 11, 5), ("l09_good.npz", 20, 6), ("l09_zero.npz", 20, 6),
+        ("l10_varying_beams.log", 11, 6), ("l11_closed_721.log", 3, 6),
+    ],
+)  # fmt: skip
+def test_logs_that_fell_short(name, scans, walls):
+    log = read_log(CASES / name)
+    made = map_log(log)
+    assert not log.broken
+    assert (len(log), made.rho.size) == (scans, walls)
+    # the long wall of the room, part of it dark in l09
+    wall = np.abs(made.segments[:, [1, 3]] - 5.0).max(axis=1) < 0.05
+    assert distance(np.c_[np.linspace(1.1, 11.0, 50), np.full(50, 5.0)], made.segments[wall]).max() < 0.05

@@ -45,8 +45,8 @@ MOUNTS = {"robot_frontlaser_offset": 0, "robot_frontlaser_side_offset": 1, "robo
 """Parameters of where the laser sits on the robot, and the component of the pose that each is."""
 SAME = 0.02, math.radians(1.0)
 """Poses that differ by no more tell of one trajectory, m and rad."""
-MOVED = 0.1
-"""A robot that went less than that has not moved, m."""
+MOVED = 0.1, 0.1
+"""A robot that went and turned less than that has not moved, m and rad."""
 _NAME = re.compile(r"[A-Z][A-Z0-9_]*$")
 
 
@@ -326,7 +326,7 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
 
     laser, robot = np.array([scan.pose[:3] for scan in scans]), np.array([scan.pose[3:] for scan in scans])
     of_robot = "odom_x odom_y odom_theta" if message == "FLASER" else "robot_x robot_y robot_theta"
-    told = bool((np.abs(robot) <= FARTHEST).all()) and (_way(robot) > MOVED or _way(laser) <= MOVED)
+    told = bool((np.abs(robot) <= FARTHEST).all()) and (_moves(robot) or not _moves(laser))
     if told:
         fixed = _constant(between(robot, laser))
         if fixed is None:
@@ -358,9 +358,10 @@ def _times(stamps: np.ndarray) -> np.ndarray | None:
     return stamps if sound else None
 
 
-def _way(poses: np.ndarray) -> float:
-    """How far poses lie from the first one at most, m."""
-    return float(np.hypot(*(poses[:, :2] - poses[0, :2]).T).max())
+def _moves(poses: np.ndarray) -> bool:
+    """Whether the poses (n, 3) differ."""
+    off = between(poses[0], poses)
+    return bool((np.hypot(off[:, 0], off[:, 1]) > MOVED[0]).any() or (np.abs(off[:, 2]) > MOVED[1]).any())
 
 
 def _constant(seen: np.ndarray) -> np.ndarray | None:
