@@ -19,6 +19,7 @@ import tyro
 
 from polyexplore_gym.config import EnvConfig, PlanFileConfig, from_mapping, to_mapping
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+from polyexplore_gym.presets import PresetName
 
 if TYPE_CHECKING:
     from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
@@ -75,6 +76,8 @@ class Bench:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
     reference: str = "nearest"
@@ -102,6 +105,8 @@ class Run:
     """Where nodes are placed, instead of what the configuration says."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     gif: Path | None = None
@@ -192,6 +197,8 @@ class Eval:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
@@ -202,8 +209,9 @@ class Eval:
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
-    Logs are CARMEN (FLASER or ROBOTLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b)
-    and poses (n, 3), in rad and m, and optionally max_range and pose_covariance, (3, 3) or (n, 3, 3).
+    Logs are ROS 1 bags, ROS 2 bags (the folder, or a .db3 or .mcap file; both need the extra "logs"), CARMEN (FLASER,
+    ROBOTLASER1 or RAWLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b) and poses
+    (n, 3), in rad and m, and optionally max_range, pose_covariance, odometry, times and time_increment.
     """
 
     log: tyro.conf.Positional[Path]
@@ -218,6 +226,10 @@ class Linemap:
     """Standard deviation of the beam angle noise, degrees."""
     range_floor: float = 0.01
     """Smallest standard deviation of range assumed in the fit, m."""
+    topic: str | None = None
+    """Topic of the scans in a bag (default: the one with the most scans)."""
+    trajectory_in: Path | None = None
+    """File of poses of the laser, in the TUM format, to be used instead of those in the log."""
     field_of_view: float | None = None
     """FLASER only: angle between the first and the last beam, degrees (default: 180, less a step if beams are even)."""
     sigma_xy: float = 0.02
@@ -277,7 +289,7 @@ def evaluate_model(options: Eval) -> int:
             "--against: names of policies, of which none is 'learned': so the model is called here"
         )
     policies["learned"] = make_policy("learned", model=options.model)
-    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "config", "plots")
+    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "preset", "config", "plots")
     fields = {name: getattr(options, name) for name in same}
     return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
 
@@ -291,7 +303,7 @@ def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
-    config = _config(options.config, options.drive)
+    config = _config(options.config, options.preset, options.drive)
     study = Study(
         policies=policies,
         plans=list(_bench_plans(options, config)),
@@ -348,7 +360,7 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation.runner import make_env
 
     _check_run(options)
-    config = _config(options.config, options.drive, options.placement)
+    config = _config(options.config, options.preset, options.drive, options.placement)
     plan = _plan(options.plan, config.robot.radius, options.start, options.reading)
     policy = load_policy(options.policy)
     env = make_env(config)
@@ -422,6 +434,8 @@ def linemap(options: Linemap) -> int:
     with tqdm(total=size, desc="read", unit="B", unit_scale=True, dynamic_ncols=True) as bar:
         log = read_log(
             options.log,
+            topic=options.topic,
+            trajectory=options.trajectory_in,
             field_of_view=None if fov is None else math.radians(fov),
             watch=lambda done: bar.update(done - bar.n),
         )
@@ -435,7 +449,9 @@ def linemap(options: Linemap) -> int:
     if len(log.broken) > SHOWN:
         _say(f"left out: {len(log.broken) - SHOWN} more")
     for message, number in log.unread.items():
-        _say(f"left out: {number} {message} scans; the FLASER scans are read")
+        _say(f"left out: {number} {message} scans; the {log.read} scans are read")
+    for note in log.notes:
+        _say(f"note: {note}")
     sensor = sensor_of(log, options.max_range, options.sigma_range, math.radians(options.sigma_angle))
     result = map_log(
         log,
@@ -490,14 +506,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
 
 
-def _config(path: Path | None, drive: str | None, placement: str | None = None) -> EnvConfig:
-    config = EnvConfig()
+def _config(path: Path | None, preset: str | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+    values: Any = {}
     if path is not None:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InvalidConfigError(f"{path}: cannot be read: {error}") from error
-        config = from_mapping(EnvConfig, values, path=str(path))
+    if preset is not None and isinstance(values, dict):
+        values = {**values, "preset": preset}
+    config = from_mapping(EnvConfig, values, path=str(path or "config"))
     if drive is not None:
         config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
     if placement is not None:
@@ -635,7 +653,12 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
         f"{percent} % after " + (f"{d:.1f} m" if d is not None else "- (never)")
         for percent, d in ((90, record.distance_90), (95, record.distance_95), (99, record.distance_99))
     ]
-    status = record.status if record.error is None else f"failed: {record.error}"
+    left = (
+        ("out of reach", record.unreached, record.unreached_length),
+        ("given up", record.given_up, record.given_up_length),
+    )
+    told = [f"{n} jump edges ({length:.1f} m) {what}" for what, n, length in left if n]
+    status = ", ".join([record.status if record.error is None else f"failed: {record.error}", *told])
     return (
         f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
         f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"
@@ -679,15 +702,19 @@ def _map_files(options: Linemap) -> list[Path]:
 def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
     points, lines = len(made.points), made.rho.size
     on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
+    fewest, most = (limit(angles.size for angles in log.angles) for limit in (min, max))
+    beams = str(most) if fewest == most else f"{fewest} to {most}"
     return (
-        f"{name}: {len(log.ranges)} scans of {log.angles.size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"{name}: {len(log)} scans of {beams} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"  poses         {log.poses_are}{f': {log.why}' if log.why else ''}\n"
         f"  points        {points} ({on_lines})\n"
         f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
         f"{len(made.fragments)} fragments\n"
         f"  compression   {f'{100 * made.compression:.2f} % (lines to points)' if lines else '-'}\n"
         f"  distance      {f'{1e3 * made.median_distance:.1f} mm' if lines else '-'} "
         "(median, from the points on lines to the nearest segment)\n"
-        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut"
+        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut\n"
+        f"  misfit        {100 * made.misfit:.1f} % (median over the scans of the beams that pass through walls)"
     )
 
 

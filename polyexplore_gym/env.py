@@ -14,13 +14,13 @@ from gymnasium import spaces
 from polyexplore_gym import observation
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
-from polyexplore_gym.exploration import ExplorationMap
+from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
 from polyexplore_gym.floorplan import suite as suite_named
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
-from polyexplore_gym.sim.coverage import Coverage, grid_points
+from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
 from polyexplore_gym.sim.pose import PoseModel
 from polyexplore_gym.sim.world import World
 from polyexplore_gym.snapshot import Snapshot
@@ -29,8 +29,6 @@ WINDOW_FPS = 10.0
 """The window shows at most so many pictures a second."""
 WINDOW_STEP = 0.5
 """Way between two pictures of a drive in the window, m."""
-COVERAGE_GRID = 0.2
-"""Spacing of the sample points behind `info["coverage"]`, m."""
 
 
 class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
@@ -124,8 +122,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.plan = plan
         self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
-        self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
-        self._lines = LineMap(c.mapping, c.sensor)
+        self._coverage = Coverage(grid_points(plan.segments, grid_spacing(c.robot.radius, plan.area)))
+        self._mapping = c.mapping.resolved(c.robot.radius)
+        self._lines = LineMap(self._mapping, c.sensor)
         self._localizer = Localizer() if c.pose.mode == "slam" else None
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
@@ -138,7 +137,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._path = self._pose_model.estimate[None, :2]
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
         self._observe()
-        info = self._info(StepOutcome(), invalid=False)
+        info = self._info(StepOutcome(), invalid=False, truncated=False)
         if self.render_mode == "human":
             self.render()
         return self._observation(), info
@@ -172,9 +171,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             invalid_action=float(choice and not valid),
         )
         self._completed = terminated
-        info = self._info(outcome, invalid=not valid)
-        reward = float(sum(info["rewards"].values()))
         truncated = not terminated and self._decisions >= self.config.max_decisions
+        info = self._info(outcome, invalid=not valid, truncated=truncated)
+        reward = float(sum(info["rewards"].values()))
         if scene is not None:
             self._show_motion(scene, node if valid else None)
         return self._observation(), reward, terminated, truncated, info
@@ -289,7 +288,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         assert self._world is not None
         laser = self._world.laser
         ranges = laser.measure(self._world.segments, pose, self._laser_rng)
-        found = extract_lines(laser.angles, ranges, self.config.sensor, self.config.mapping)
+        found = extract_lines(laser.angles, ranges, self.config.sensor, self._mapping)
         estimate, covariance = self._pose_model.measured(pose)
         if self._localizer is None:
             return ranges, found, Correction.none(estimate, covariance)
@@ -334,7 +333,15 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """The observation, the caller's own to change."""
         return {key: value.copy() for key, value in self._observed.arrays.items()}
 
-    def _info(self, outcome: StepOutcome, *, invalid: bool) -> dict[str, Any]:
+    def _outcome(self, truncated: bool) -> dict[str, Any]:
+        """How the episode stands, and which jump edges (number and metres) it leaves."""
+        if not truncated and self._observed.arrays["action_mask"].any():
+            return {"status": "running", **Remains(0, 0.0, 0, 0.0)._asdict()}
+        left = self._exploration.remains()
+        status = "budget" if truncated else "unreached" if left.unreached or left.given_up else "complete"
+        return {"status": status, **left._asdict()}
+
+    def _info(self, outcome: StepOutcome, *, invalid: bool, truncated: bool) -> dict[str, Any]:
         return {
             "action_mask": self._observed.arrays["action_mask"].copy(),
             "distance": self._distance,
@@ -346,6 +353,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             "path": tuple(map(tuple, self._path.tolist())),
             "rewards": rewards(outcome, self.config.reward),
             "invalid_action": invalid,
+            "outcome": self._outcome(truncated),
             "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
         }
 

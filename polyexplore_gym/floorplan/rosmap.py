@@ -333,9 +333,8 @@ def _region(
     try:
         reached = Reached(part, disc, inner, fine)
     except InvalidFloorPlanError as error:
-        raise InvalidFloorPlanError(
-            f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
-        ) from error
+        reason = f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
+        raise InvalidFloorPlanError(reason) from error
     region = np.zeros_like(free)
     region[top:bottom, left:right] = reached.region
     kept, total = int(reached.region.sum()), int(part.sum())

@@ -57,15 +57,15 @@ def test_free_motion_is_what_pymunk_integrates() -> None:
     robot, step = RobotConfig(), 0.04
     limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
     path = np.array([[0.0, 0.0], [2.0, 0.3], [2.5, 1.5], [1.0, 3.0]])
-    speeds = follower.vertex_speeds(path, limits)
+    speeds = follower.vertex_speeds(path, limits, robot.radius)
     space = pymunk.Space()
     body = pymunk.Body(robot.mass, 1.0)
     space.add(body, pymunk.Circle(body, robot.radius))
-    state = np.zeros(8)
+    state = np.zeros(9)
     state[follower.PHASE] = follower.ALIGN
     rows = []
     while True:
-        follower.command(state, path, speeds, 1.0, True, limits, robot.track, step)
+        follower.command(state, path, speeds, 1.0, True, limits, (robot.radius, robot.track), step)
         if state[follower.PHASE] >= follower.DONE:
             break
         body.velocity = state[follower.SPEED] * math.cos(body.angle), state[follower.SPEED] * math.sin(body.angle)
@@ -84,7 +84,7 @@ def test_vertex_speeds_leave_room_to_brake() -> None:
     rng = np.random.default_rng(8)
     for _ in range(100):
         path = random_path(rng, 0.05, 3.0)
-        speeds = follower.vertex_speeds(path, (1.2, 3.0, 0.6, 5.0))
+        speeds = follower.vertex_speeds(path, (1.2, 3.0, 0.6, 5.0), 0.25)
         legs = np.hypot(*np.diff(path, axis=0).T)
         turns = np.abs(wrapped(np.diff(np.arctan2(*np.diff(path, axis=0).T[::-1]))))
         assert speeds[-1] == 0.0
