@@ -333,9 +333,8 @@ def _region(
     try:
         reached = Reached(part, disc, inner, fine)
     except InvalidFloorPlanError as error:
-        raise InvalidFloorPlanError(
-            f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
-        ) from error
+        reason = f"{error} (a robot of radius {radius:g} m, pixels of {grid.resolution:g} m)"
+        raise InvalidFloorPlanError(reason) from error
     region = np.zeros_like(free)
     region[top:bottom, left:right] = reached.region
     kept, total = int(reached.region.sum()), int(part.sum())
@@ -436,48 +435,50 @@ class Reached:
         best = 1 + int(np.argmax(areas))
         largest = int(areas[best - 1])
         if self._disc <= 0:
-            at = tuple(np.argwhere(labels == best)[0].tolist())
+            at = divmod(int((labels == best).argmax()), labels.shape[1])
             return _LostPixels(largest, at, 0.0, at, 0.0)
         fine = self._fine
         inside = labels == best
         coarse = self._distance[1:-1, 1:-1][::fine, ::fine]
         # The deepest pixel of the part stands for it.
-        deepest = np.where(inside, coarse, -1.0).argmax()
-        at = tuple(int(i) for i in np.unravel_index(deepest, inside.shape))
+        at = divmod(int(np.where(inside, coarse, -1.0).argmax()), inside.shape[1])
         row, column = at[0] * fine + 1, at[1] * fine + 1
-        home = np.unravel_index(np.where(self._centres, self._distance, -1.0).argmax(), self._centres.shape)
+        home = divmod(int(np.where(self._centres, self._distance, -1.0).argmax()), self._centres.shape[1])
+        steps = STEPS if self._free.size <= _FINE else STEPS // 4
 
         @cache
         def shares(step: int) -> tuple[bool, bool]:
             """Whether a disc of that size gets to the lost part, and whether it keeps most."""
-            mask = (self._distance >= step / STEPS * self._disc * fine).astype(np.uint8)
-            count, found = cv2.connectedComponents(mask, connectivity=4)
-            areas = np.bincount(found.ravel(), minlength=count)
+            mask = (self._distance >= step / steps * self._disc * fine).astype(np.uint8)
+            _, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+            areas = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
             main = found[home]
             reaches = bool(mask[row, column]) and found[row, column] == main
             return reaches, keeps_most([areas[main], *np.delete(areas, [0, main])])
 
-        step = last_true(lambda step: shares(step)[0])
+        step = last_true(lambda step: shares(step)[0], steps)
         return _LostPixels(
             largest,
             at,
-            (step + 0.5) / STEPS * self._disc if step else 0.0,
-            self._stopped((row, column), (step + 1) / STEPS),
-            last_true(lambda step: shares(step)[1]) / STEPS * self._disc,
+            (step + 0.5) / steps * self._disc if step else 0.0,
+            self._stopped(home, (row, column), (step + 1) / steps * self._disc) if step else at,
+            last_true(lambda step: shares(step)[1], steps) / steps * self._disc,
         )
 
-    def _stopped(self, target: tuple[int, int], share: float) -> tuple[int, int]:
-        """The pixel of the target's side that is nearest to where a slightly smaller disc gets."""
+    def _stopped(self, home: tuple[int, int], target: tuple[int, int], disc: float) -> tuple[int, int]:
+        """The pixel on the target's side that is nearest to where a disc gets that is just too large to pass."""
         import cv2
 
-        mask = (self._distance >= share * self._disc * self._fine).astype(np.uint8)
+        mask = (self._distance >= disc * self._fine).astype(np.uint8)
         mask[target] = 1
         _, found = cv2.connectedComponents(mask, connectivity=4)
-        main = found == found[np.unravel_index(self._centres.argmax(), self._centres.shape)]
-        off = cv2.distanceTransform((~main).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        gap = np.where(found == found[target], off, np.inf)
-        row, column = np.unravel_index(gap.argmin(), gap.shape)
-        return int(row - 1) // self._fine, int(column - 1) // self._fine
+        top, bottom, left, right = _box(found == found[target])
+        margin = int(4 * self._disc * self._fine) + 4
+        top, left = max(top - margin, 0), max(left - margin, 0)
+        part = found[top : bottom + margin, left : right + margin]
+        off = cv2.distanceTransform((part != found[home]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        row, column = np.unravel_index(np.where(part == found[target], off, np.inf).argmin(), part.shape)
+        return (int(row) + top - 1) // self._fine, (int(column) + left - 1) // self._fine
 
 
 def component(mask: np.ndarray, seed: tuple[int, int] | None) -> np.ndarray | None:
