@@ -76,8 +76,6 @@ class RobotConfig:
     """Largest forward acceleration and deceleration, m/s2."""
     max_turn_acceleration: float = math.radians(300.0)
     """Largest angular acceleration, rad/s2."""
-    mass: float = 9.0
-    """Mass, kg (data sheet)."""
 
     def __post_init__(self) -> None:
         _require_finite(self)
@@ -90,7 +88,7 @@ class DriveConfig:
     """How the robot gets to a node."""
 
     mode: Literal["physics", "kinematic"] = "physics"
-    """`physics`: pymunk, wheels and contact; `kinematic`: along the path, without dynamics, for training."""
+    """`physics`: wheels and contact with walls; `kinematic`: along the path, without dynamics, for training."""
     time_step: float = 0.04
     """Fixed step of the physics, s."""
     time_limit: float = 600.0

@@ -160,7 +160,7 @@ class World:
         state = np.zeros(9)
         state[:3] = self._pose
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
-        speeds = follower.vertex_speeds(path, self._limits, robot.radius)
+        speeds = follower.vertex_speeds(path, self._limits, robot.radius, step)
         steps = max(1, math.ceil(self.config.time_limit / step))
         parts, done = [self._pose[None]], 0
         while done < steps and state[follower.PHASE] < follower.DONE:
