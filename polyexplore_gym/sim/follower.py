@@ -50,6 +50,9 @@ _AIM, _TURN_BACK = 0.12, 0.08
 does not stop to turn any more."""
 _BUMP = 0.08
 """A drive ends when a wall has taken this much of the commanded motion, radii (2 cm at 0.25 m)."""
+_STALL = 0.04
+"""Wheels that a wall holds turn on with what they reach from rest in this time (s) or in a step, if that is longer:
+a short step makes a bump no later."""
 _ROUNDING = 1e-9
 """Share of a motion; walls that take less have taken nothing."""
 
@@ -215,7 +218,7 @@ def forget(state, progress):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _push(state, step, walls, radius, bends):  # type: ignore[no-untyped-def]
+def _push(state, acceleration, step, walls, radius, bends):  # type: ignore[no-untyped-def]
     """One step among walls in reach: they take what of the motion leads into them. Returns the number of bends."""
     x, y = state[X], state[Y]
     c, s = math.cos(state[HEADING]), math.sin(state[HEADING])
@@ -227,7 +230,7 @@ def _push(state, step, walls, radius, bends):  # type: ignore[no-untyped-def]
     if lost > _ROUNDING * moved:
         state[DEFICIT] += lost
         state[MET] = 1.0
-        state[SPEED] = max(0.0, progress / step)
+        state[SPEED] = max(progress / step, min(state[SPEED], acceleration * max(_STALL - step, 0.0)))
     forget(state, progress)
     return n
 
@@ -267,7 +270,7 @@ def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, 
             forget(state, moved)
             clear -= moved
         else:
-            n = _push(state, step, walls, radius, bends)
+            n = _push(state, limits[2], step, walls, radius, bends)
             clear = 0.0
         for k in range(n):
             trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = bends[k, 0], bends[k, 1], state[HEADING]

@@ -33,7 +33,8 @@ class DriveResult:
     """What a drive did."""
 
     trajectory: np.ndarray
-    """(m, 3) true poses along the way, the first the start; m >= 1."""
+    """(m, 3) true poses along the way, the first the start: at every vertex (kinematic), or after every time step and
+    where walls bend the way (physics); m >= 1. The centre moves straight from one to the next."""
     distance: float
     """Way travelled by the centre of the body, m."""
     duration: float

@@ -178,6 +178,16 @@ def test_no_wall_throws_the_robot(step: float) -> None:
         assert (np.diff(way[:, 0])[way[1:, 0] > 4.74] >= -1e-12).all()  # at the wall it is only ever held
 
 
+def test_a_bump_is_felt_as_soon_with_short_steps() -> None:
+    times = []
+    for step in (0.001, 0.005, 0.02, 0.04):
+        world = make("physics", (4.7499, 0.0, 0.0), time_step=step)
+        result = world.drive(np.array([[4.7499, 0.0], [6.0, 0.0]]))
+        assert result.collided
+        times.append(result.duration)
+    assert max(times) - min(times) < 0.1
+
+
 def scaled_drives(mode: str, scale: float) -> list[DriveResult]:
     """Ten drives among walls, everything that has a length made larger; times and angles as they are."""
     rng, out = np.random.default_rng(14), []
