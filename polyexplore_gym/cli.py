@@ -11,14 +11,15 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.config import EnvConfig, PlanFileConfig, from_mapping, to_mapping
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+from polyexplore_gym.presets import PresetName
 
 if TYPE_CHECKING:
     from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
@@ -39,8 +40,8 @@ LOOK_AHEAD = ("tour", "watchman", "rollout")
 SHOWN = 10
 """So many broken parts of a log are named, the rest is counted."""
 
-PLAN_SUFFIXES = (".json", ".geojson", ".yaml", ".yml")
-"""What is taken for a plan in a folder."""
+FOLDER_SUFFIXES = (".json", ".geojson", ".yaml", ".yml", ".dxf")
+"""What is taken for a plan in a folder; .svg is not, since pictures are."""
 
 Placement = Literal["midpoint", "in_front"]
 Drive = Literal["physics", "kinematic"]
@@ -75,6 +76,8 @@ class Bench:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
     reference: str = "nearest"
@@ -83,6 +86,7 @@ class Bench:
     """Folder of references that know the plans (those missing are computed, a minute each): adds ratios to them."""
     plots: bool = True
     """Draw the plots."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +105,8 @@ class Run:
     """Where nodes are placed, instead of what the configuration says."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     gif: Path | None = None
@@ -115,6 +121,24 @@ class Run:
     """Film: a frame every so many metres as well; 0: decisions only."""
     fps: float = 10.0
     """Film: frames a second."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Read a floor plan file, say what a robot can reach of it, and write it in other formats."""
+
+    plan: tyro.conf.Positional[str]
+    """A plan file, or a plan of a suite: home-test/3."""
+    out: tuple[Path, ...] = ()
+    """Files to write: .json, .geojson, .dxf, .svg, or .yaml for a map of ROS map_server with its .pgm."""
+    radius: float = 0.25
+    """Radius of the robot, m; 0: everything that is connected."""
+    start: tuple[float, float] | None = None
+    """A point x, y in the part that is meant, m; the largest part if left out."""
+    resolution: float = 0.05
+    """Side of a pixel of the maps written, m."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,6 +197,8 @@ class Eval:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
@@ -183,8 +209,9 @@ class Eval:
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
-    Logs are CARMEN (FLASER or ROBOTLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b)
-    and poses (n, 3), in rad and m, and optionally max_range and pose_covariance, (3, 3) or (n, 3, 3).
+    Logs are ROS 1 bags, ROS 2 bags (the folder, or a .db3 or .mcap file; both need the extra "logs"), CARMEN (FLASER,
+    ROBOTLASER1 or RAWLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b) and poses
+    (n, 3), in rad and m, and optionally max_range, pose_covariance, odometry, times and time_increment.
     """
 
     log: tyro.conf.Positional[Path]
@@ -199,6 +226,10 @@ class Linemap:
     """Standard deviation of the beam angle noise, degrees."""
     range_floor: float = 0.01
     """Smallest standard deviation of range assumed in the fit, m."""
+    topic: str | None = None
+    """Topic of the scans in a bag (default: the one with the most scans)."""
+    trajectory_in: Path | None = None
+    """File of poses of the laser, in the TUM format, to be used instead of those in the log."""
     field_of_view: float | None = None
     """FLASER only: angle between the first and the last beam, degrees (default: 180, less a step if beams are even)."""
     sigma_xy: float = 0.02
@@ -258,7 +289,7 @@ def evaluate_model(options: Eval) -> int:
             "--against: names of policies, of which none is 'learned': so the model is called here"
         )
     policies["learned"] = make_policy("learned", model=options.model)
-    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "config", "plots")
+    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "preset", "config", "plots")
     fields = {name: getattr(options, name) for name in same}
     return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
 
@@ -272,7 +303,7 @@ def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
-    config = _config(options.config, options.drive)
+    config = _config(options.config, options.preset, options.drive)
     study = Study(
         policies=policies,
         plans=list(_bench_plans(options, config)),
@@ -329,8 +360,8 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation.runner import make_env
 
     _check_run(options)
-    config = _config(options.config, options.drive, options.placement)
-    plan = _plan(options.plan)
+    config = _config(options.config, options.preset, options.drive, options.placement)
+    plan = _plan(options.plan, config.robot.radius, options.start, options.reading)
     policy = load_policy(options.policy)
     env = make_env(config)
     start = {}
@@ -358,6 +389,28 @@ def run(options: Run) -> int:
     return 0 if record.status != "failed" else 1
 
 
+def plan(options: Plan) -> int:
+    """Read a plan and write it."""
+    from polyexplore_gym.floorplan import PLAN_SUFFIXES, save_plan
+
+    for path in options.out:
+        if path.suffix.lower() not in PLAN_SUFFIXES:
+            raise InvalidConfigError(f"{path}: the name must end in {', '.join(PLAN_SUFFIXES)}")
+        if not path.parent.is_dir():
+            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+    found = _plan(options.plan, options.radius, options.start, options.reading)
+    x0, y0, x1, y1 = found.bounds
+    print(f"{found.name}: {found.area:.1f} m2, {x1 - x0:.2f} x {y1 - y0:.2f} m, {found.n_vertices} vertices, "
+          f"{len(found.holes)} holes")  # fmt: skip
+    for path in options.out:
+        try:
+            save_plan(found, path, resolution=options.resolution)
+        except OSError as error:
+            raise InvalidConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+        print(f"written: {path}")
+    return 0
+
+
 def linemap(options: Linemap) -> int:
     """Make the line map of a log."""
     import math
@@ -381,6 +434,8 @@ def linemap(options: Linemap) -> int:
     with tqdm(total=size, desc="read", unit="B", unit_scale=True, dynamic_ncols=True) as bar:
         log = read_log(
             options.log,
+            topic=options.topic,
+            trajectory=options.trajectory_in,
             field_of_view=None if fov is None else math.radians(fov),
             watch=lambda done: bar.update(done - bar.n),
         )
@@ -394,7 +449,9 @@ def linemap(options: Linemap) -> int:
     if len(log.broken) > SHOWN:
         _say(f"left out: {len(log.broken) - SHOWN} more")
     for message, number in log.unread.items():
-        _say(f"left out: {number} {message} scans; the FLASER scans are read")
+        _say(f"left out: {number} {message} scans; the {log.read} scans are read")
+    for note in log.notes:
+        _say(f"note: {note}")
     sensor = sensor_of(log, options.max_range, options.sigma_range, math.radians(options.sigma_angle))
     result = map_log(
         log,
@@ -424,6 +481,7 @@ _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (Train, train),
     "eval": (Eval, evaluate_model),
     "report": (Report, report),
+    "plan": (Plan, plan),
     "linemap": (Linemap, linemap),
 }
 
@@ -448,14 +506,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
 
 
-def _config(path: Path | None, drive: str | None, placement: str | None = None) -> EnvConfig:
-    config = EnvConfig()
+def _config(path: Path | None, preset: str | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+    values: Any = {}
     if path is not None:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InvalidConfigError(f"{path}: cannot be read: {error}") from error
-        config = from_mapping(EnvConfig, values, path=str(path))
+    if preset is not None and isinstance(values, dict):
+        values = {**values, "preset": preset}
+    config = from_mapping(EnvConfig, values, path=str(path or "config"))
     if drive is not None:
         config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
     if placement is not None:
@@ -463,7 +523,7 @@ def _config(path: Path | None, drive: str | None, placement: str | None = None) 
     return config
 
 
-def _plan(name: str) -> FloorPlan:
+def _plan(name: str, radius: float, start: Sequence[float] | None, reading: PlanFileConfig) -> FloorPlan:
     """A plan by path, or by suite and number; what exists as a file is a path."""
     from polyexplore_gym.floorplan import load_plan
 
@@ -473,7 +533,7 @@ def _plan(name: str) -> FloorPlan:
         if int(number) >= len(suite):
             raise InvalidFloorPlanError(f"{name}: {suite_name} has the plans 0 to {len(suite) - 1}")
         return suite.plan(int(number))
-    return load_plan(name)
+    return load_plan(name, radius=radius, start=start, **to_mapping(reading))
 
 
 def _suite(name: str) -> Any:
@@ -505,7 +565,7 @@ def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
         if len(known) == first:
             break
         try:
-            plan = load_plan(path)
+            plan = load_plan(path, radius=config.robot.radius, **to_mapping(options.reading))
             plan.check_connected(config.robot.radius)
         except InvalidFloorPlanError as error:
             text = str(error)
@@ -523,7 +583,7 @@ def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
 def _plan_files(paths: Iterable[Path]) -> Iterator[Path]:
     for path in paths:
         if path.is_dir():
-            yield from sorted(p for p in path.iterdir() if p.suffix.lower() in PLAN_SUFFIXES and p.is_file())
+            yield from sorted(p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and p.is_file())
         else:
             yield path
 
@@ -562,7 +622,7 @@ def _check_run(options: Run) -> None:
     if not 0.1 <= options.fps <= 100:
         raise InvalidConfigError(f"--fps {options.fps}: must lie in 0.1 to 100")
     if any((options.gif, options.mp4, options.png)):
-        from polyexplore_gym.animation import require
+        from polyexplore_gym.optional import require
 
         for module in ("matplotlib", *(["PIL"] if options.gif else []), *(["imageio_ffmpeg"] if options.mp4 else [])):
             require(module, "plots")
@@ -593,7 +653,12 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
         f"{percent} % after " + (f"{d:.1f} m" if d is not None else "- (never)")
         for percent, d in ((90, record.distance_90), (95, record.distance_95), (99, record.distance_99))
     ]
-    status = record.status if record.error is None else f"failed: {record.error}"
+    left = (
+        ("out of reach", record.unreached, record.unreached_length),
+        ("given up", record.given_up, record.given_up_length),
+    )
+    told = [f"{n} jump edges ({length:.1f} m) {what}" for what, n, length in left if n]
+    status = ", ".join([record.status if record.error is None else f"failed: {record.error}", *told])
     return (
         f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
         f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"
@@ -610,8 +675,8 @@ def _stem(log: Path) -> str:
 
 def _map_files(options: Linemap) -> list[Path]:
     """The files to write; rejects what cannot be written before the work and not after it."""
-    from polyexplore_gym.animation import require
     from polyexplore_gym.mapping import MAP_SUFFIXES
+    from polyexplore_gym.optional import require
 
     if not 100 <= options.width <= 20_000:
         raise InvalidConfigError(f"--width {options.width}: must lie in 100 to 20000")
@@ -637,15 +702,19 @@ def _map_files(options: Linemap) -> list[Path]:
 def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
     points, lines = len(made.points), made.rho.size
     on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
+    fewest, most = (limit(angles.size for angles in log.angles) for limit in (min, max))
+    beams = str(most) if fewest == most else f"{fewest} to {most}"
     return (
-        f"{name}: {len(log.ranges)} scans of {log.angles.size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"{name}: {len(log)} scans of {beams} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"  poses         {log.poses_are}{f': {log.why}' if log.why else ''}\n"
         f"  points        {points} ({on_lines})\n"
         f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
         f"{len(made.fragments)} fragments\n"
         f"  compression   {f'{100 * made.compression:.2f} % (lines to points)' if lines else '-'}\n"
         f"  distance      {f'{1e3 * made.median_distance:.1f} mm' if lines else '-'} "
         "(median, from the points on lines to the nearest segment)\n"
-        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut"
+        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut\n"
+        f"  misfit        {100 * made.misfit:.1f} % (median over the scans of the beams that pass through walls)"
     )
 
 

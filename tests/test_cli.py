@@ -68,7 +68,7 @@ def test_a_folder_is_compared(folder, tmp_path, capsys):
     assert "2 plans x 2 starts x 2 placements x 2 policies = 16 episodes" in captured.err
     records = read_records(out)
     assert len(records) == 16
-    assert {r.status for r in records} == {"complete"}
+    assert all(r.ended for r in records)
     assert {r.drive for r in records} == {"kinematic"}
     assert {r.plan for r in records} == {"rooms", "small"}
     assert {p["name"] for p in read_manifest(out)["study"]["plans"]} == {"rooms", "small"}
@@ -150,11 +150,36 @@ def test_a_configuration_file(folder, tmp_path, capsys):
     assert main(["bench", *arguments, "--config", str(config), "--workers", "1", "--out", str(out)]) == 0
     assert read_manifest(out)["study"]["config"]["sensor"]["beams"] == 181
     assert {(r.placement, r.drive) for r in read_records(out)} == {("in_front", "kinematic")}
+    out = tmp_path / "preset"
+    command = ["bench", *arguments, "--preset", "turtlebot4", "--config", str(config), "--workers", "1"]
+    assert main([*command, "--out", str(out)]) == 0
+    kept = read_manifest(out)["study"]["config"]
+    assert (kept["sensor"]["beams"], kept["sensor"]["max_range"], kept["robot"]["radius"]) == (181, 12.0, 0.17)
     config.write_text(json.dumps({"sensor": {"beems": 181}}))
     assert main(["bench", *arguments, "--config", str(config)]) == 2
     error = capsys.readouterr().err
     assert "beems" in error
     assert "config.json.sensor" in error
+
+
+def test_what_is_left_is_told(folder, capsys, monkeypatch):
+    from polyexplore_gym.env import PolyExploreEnv
+
+    left = {"status": "unreached", "unreached": 3, "unreached_length": 2.5, "given_up": 1, "given_up_length": 0.75}
+    monkeypatch.setattr(PolyExploreEnv, "_outcome", lambda self, truncated: left)
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    told = capsys.readouterr().out.splitlines()[0]
+    assert told.endswith("kinematic: unreached, 3 jump edges (2.5 m) out of reach, 1 jump edges (0.8 m) given up")
+
+
+def test_a_robot_by_name(folder, capsys):
+    assert main(["run", str(folder / "rooms.json"), "--preset", "turtlebot3", "--drive", "kinematic"]) == 0
+    slow = capsys.readouterr().out
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    assert slow != capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["run", str(folder / "rooms.json"), "--preset", "r2d2"])
+    assert "turtlebot4" in capsys.readouterr().err
 
 
 def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):

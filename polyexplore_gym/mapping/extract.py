@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,7 +16,7 @@ from polyexplore_gym.mapping.grouping import UNDECIDED, attach, cut, fit_labels,
 from polyexplore_gym.mapping.hough import hough_labels
 
 COLLINEAR_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
-LEAST_RANGE_NOISE = 1e-3  # m; a noise-free sensor is fitted with these, so that weights stay finite
+LEAST_RANGE_NOISE = 2e-3  # of a door's width; a noise-free sensor is fitted with these, so that weights stay finite
 LEAST_ANGLE_NOISE = 1e-4  # rad
 LEAST_RANGE = 1e-6  # m; the square of a much smaller one would be 0
 
@@ -35,11 +36,12 @@ class ScanLines:
     segment_line: np.ndarray
     """(K,) index of the line of each segment."""
     point_segment: np.ndarray
-    """(n,) index of the segment the return of each beam lies on, -1 for none."""
+    """(n,) index of the segment the return of each beam lies on, -1 for none; beams in the order given."""
     fragments: np.ndarray
     """(F, 4) short pieces joining neighbouring leftover returns, m: obstacles without a trusted covariance."""
     smoothed: np.ndarray
-    """(n,) ranges, m, inf without a return; on a line, where the nominal beam meets it (raw above 80 degrees)."""
+    """(n,) ranges, m, inf without a return, NaN where nothing is known; on a line, where the nominal beam meets it (raw
+    above 80 degrees)."""
 
 
 def extract_lines(
@@ -51,19 +53,19 @@ def extract_lines(
     """Fit lines with covariances to one scan.
 
     A first guess (`config.start`) labels the returns; weighted fits, grouping of collinear lines,
-    attachment of free returns within 3 sigma and cutting at doorways follow. See DESIGN section 4
-    for the equations and their sources.
+    attachment of free returns within 3 sigma and cutting at doorways follow. The equations and
+    their sources stand in `fit` and `grouping`.
 
     Args:
-        angles: (n,) nominal beam angles in the robot frame, rad, strictly increasing.
-        ranges: (n,) measured ranges, m, 1e-6 or more; inf, or anything from the sensor's maximum
-            range on, is a beam without a return.
+        angles: (n,) nominal beam angles in the robot frame, rad, in any order; the lines do not depend on it.
+        ranges: (n,) measured ranges, m; inf, or anything from the sensor's maximum range on, is a beam
+            without a return: free. NaN and less than 1e-6 m (and an angle that is not finite) say nothing about
+            that beam: neither wall nor free, as if it had not been measured.
         sensor: noise, maximum range, and whether the field of view closes.
         config: numbers and limits of the fit.
 
     Raises:
-        ValueError: the arrays are not one-dimensional, differ in length, hold NaN, an angle is not
-            finite or not increasing, or a range is below 1e-6 m.
+        ValueError: the arrays are not one-dimensional, differ in length, or do not hold real numbers.
 
     Example:
         >>> import numpy as np
@@ -75,12 +77,14 @@ def extract_lines(
         (array([2.]), array([0.]), (1, 4))
     """
     sensor = SensorConfig() if sensor is None else sensor
-    config = MappingConfig() if config is None else config
-    angles, ranges = check_scan(angles, ranges)
-    sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE)
+    config = (MappingConfig() if config is None else config).resolved()
+    assert config.door_width is not None
+    assert config.min_length is not None
+    known, angles, ranges = check_scan(angles, ranges)
+    sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE * config.door_width)
     sigma_angle = max(sensor.sigma_angle, LEAST_ANGLE_NOISE)
     start, points = turned_returns(angles, ranges, sensor.max_range, sensor.full_circle)
-    resolution = (angles[-1] - angles[0]) / (angles.size - 1) if angles.size > 1 else sensor.resolution
+    resolution = _resolution(angles, known) if angles.size > 1 else sensor.resolution
     x, y, beam_of, reach_of, cos_t, sin_t = points
     noise = sigma_range**2, sigma_angle**2
     limits = config.min_points, config.min_length
@@ -90,49 +94,109 @@ def extract_lines(
         label, count = endpoint_labels(x, y, beam_of, resolution, *noise, *limits)
     if sensor.full_circle and count > 0:
         start = _reseam(x, y, beam_of, reach_of, cos_t, sin_t, label, start)
-    return ScanLines(
+    lines = ScanLines(
         *_assemble(
             x, y, beam_of, reach_of, cos_t, sin_t, start, sensor.max_range, resolution, label, count,
             sigma_range, sigma_angle, config.door_width, config.min_points, config.min_length, config.grouping,
         )
     )  # fmt: skip
+    if known is None:
+        return lines
+    at = {"point_segment": known.spread(lines.point_segment, -1), "smoothed": known.spread(lines.smoothed, math.nan)}
+    return replace(lines, **at)
 
 
-def check_scan(angles: np.ndarray, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angles and ranges as contiguous float64 arrays; ValueError for what is no scan (see `extract_lines`)."""
-    angles = np.ascontiguousarray(angles, np.float64)
-    ranges = np.ascontiguousarray(ranges, np.float64)
-    if angles.ndim != 1 or ranges.ndim != 1:
-        raise ValueError(f"angles and ranges must be one-dimensional, got shapes {angles.shape} and {ranges.shape}")
+class Known(NamedTuple):
+    """Which beams of a scan are known, in the order of their angles."""
+
+    beams: np.ndarray
+    """(k,) their indices."""
+    size: int
+    """Beams of the scan."""
+
+    def spread(self, values: np.ndarray, unknown: float) -> np.ndarray:
+        """(size,) the values (k,) of the known beams at their places, `unknown` at the others."""
+        out = np.full(self.size, unknown, values.dtype)
+        out[self.beams] = values
+        return out
+
+
+def check_scan(angles: np.ndarray, ranges: np.ndarray) -> tuple[Known | None, np.ndarray, np.ndarray]:
+    """The known beams (None: all, in the order given), their angles, increasing, and ranges as float64 arrays.
+
+    Raises ValueError for what is no scan (see `extract_lines`).
+    """
+    angles, ranges = _real(angles, "angles"), _real(ranges, "ranges")
     if angles.size != ranges.size:
         raise ValueError(f"angles and ranges differ in length: {angles.size} and {ranges.size}")
-    problem, beam = _check(angles, ranges)
-    if problem:
-        raise ValueError(_PROBLEMS[problem].format(beam=beam, angle=angles[beam], range=ranges[beam]))
-    return angles, ranges
+    sound, beams = _known(angles, ranges)
+    if sound:
+        return None, angles, ranges
+    if (np.diff(angles[beams]) >= 0.0).all():
+        return Known(beams, ranges.size), angles[beams], ranges[beams]
+    order, turned = increasing(angles[beams])
+    beams = beams[order]
+    return Known(beams, ranges.size), turned, ranges[beams]
 
 
-_PROBLEMS = {
-    1: "range of beam {beam} is NaN; give inf for a beam without a return",
-    2: "range of beam {beam} is {range}; ranges must be positive, of 1e-6 m at least",
-    3: "angle of beam {beam} is {angle}; angles must be finite",
-    4: "angle of beam {beam} is {angle}, not larger than the one before; angles must increase strictly",
-}
+def increasing(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The order (n,) in which finite beam angles (n,) increase, and the angles in it, some by full turns more or less.
+
+    Angles may decrease (a laser that turns clockwise, or hangs upside down) or jump by a full turn somewhere (from pi
+    to -pi). The field of view begins behind the widest gap only where they are mixed.
+    """
+    order = np.arange(angles.size)
+    step = np.diff(angles)
+    if (step >= 0.0).all():
+        return order, angles
+    if (step <= 0.0).all():
+        return order[::-1], np.ascontiguousarray(angles[::-1])
+    turned = np.unwrap(angles)
+    step = np.diff(turned)
+    if (step >= 0.0).all():
+        return order, turned
+    if (step <= 0.0).all():
+        return order[::-1], np.ascontiguousarray(turned[::-1])
+    turned = angles % (2.0 * math.pi)
+    order = np.argsort(turned, kind="stable")
+    turned = turned[order]
+    first = int(np.argmax(np.diff(turned, prepend=turned[-1] - 2.0 * math.pi)))
+    return np.roll(order, -first), np.concatenate([turned[first:] - 2.0 * math.pi, turned[:first]])
+
+
+def _real(values: np.ndarray, name: str) -> np.ndarray:
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise ValueError(f"{name} must be one-dimensional, got shape {array.shape}")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must be real numbers, got {array.dtype}")
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _resolution(angles: np.ndarray, known: Known | None) -> float:
+    """Angle between neighbouring beams, rad; where beams are missing that of most."""
+    if known is None or known.beams.size == known.size:
+        return (angles[-1] - angles[0]) / (angles.size - 1)
+    return float(np.median(np.diff(angles)))
 
 
 @njit(cache=True)
-def _check(angles: np.ndarray, ranges: np.ndarray) -> tuple[int, int]:
-    """Number of the first problem found (0 none) and its beam."""
-    for k in range(angles.size):
-        if math.isnan(ranges[k]):
-            return 1, k
-        if ranges[k] < LEAST_RANGE:
-            return 2, k
-        if not math.isfinite(angles[k]):
-            return 3, k
-        if k > 0 and angles[k] <= angles[k - 1]:
-            return 4, k
-    return 0, 0
+def _known(angles: np.ndarray, ranges: np.ndarray) -> tuple[bool, np.ndarray]:
+    """Whether all beams are known and their angles increase; if not, the known ones."""
+    n, before, sound = angles.size, -math.inf, True
+    for k in range(n):
+        if not (ranges[k] >= LEAST_RANGE and -math.inf < angles[k] < math.inf and angles[k] >= before):
+            sound = False
+            break
+        before = angles[k]
+    beams = np.empty(0 if sound else n, np.int64)
+    count = 0
+    if not sound:
+        for k in range(n):
+            if ranges[k] >= LEAST_RANGE and -math.inf < angles[k] < math.inf:
+                beams[count] = k
+                count += 1
+    return sound, beams[:count]
 
 
 @njit(cache=True)
@@ -222,7 +286,7 @@ def _assemble(
         x, y, beam, ranges, cos_t, sin_t, max_range, resolution, label, fits,
         sigma_range, sigma_angle, reach, min_points, min_length,
     )  # fmt: skip
-    fragments = fragment_chains(x, y, beam, where, resolution, var_range, var_angle)
+    fragments = fragment_chains(x, y, beam, where, resolution, fits, var_range, var_angle, reach)
 
     number = np.full(count, -1, np.int64)
     lines = 0

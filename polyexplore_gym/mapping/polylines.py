@@ -66,9 +66,9 @@ def extract_polylines(
     where the noise model holds, come from `extract_lines`.
 
     Args:
-        angles: (n,) beam angles in the robot frame, rad, strictly increasing.
-        ranges: (n,) measured ranges, m, 1e-6 or more; inf, or anything from the sensor's maximum
-            range on, is a beam without a return.
+        angles: (n,) beam angles in the robot frame, rad, in any order.
+        ranges: (n,) measured ranges, m; inf, or anything from the sensor's maximum range on, is a beam
+            without a return. Beams with NaN or less than 1e-6 m are left out.
         max_vertices: most vertices, at least 2.
         sensor: maximum range, and whether the field of view closes.
         miss: a return that nothing stands for counts like an error of so much, m. Less gives lower
@@ -76,8 +76,8 @@ def extract_polylines(
         max_gap: no edge joins neighbouring returns farther apart than this, m.
 
     Raises:
-        ValueError: the arrays are not one-dimensional, differ in length, hold NaN, an angle is not
-            finite or not increasing, a range is below 1e-6 m; or a number is out of its limits.
+        ValueError: the arrays are not one-dimensional, differ in length or do not hold real numbers; or a
+            number is out of its limits.
 
     Example:
         >>> import numpy as np
@@ -88,7 +88,7 @@ def extract_polylines(
         array([2.61, 0.  ])
     """
     sensor = SensorConfig() if sensor is None else sensor
-    angles, ranges = check_scan(angles, ranges)
+    known, angles, ranges = check_scan(angles, ranges)
     if max_vertices < 2:
         raise ValueError(f"max_vertices is {max_vertices}; a line has two ends")
     if not 0.0 < miss < math.inf:
@@ -104,6 +104,8 @@ def extract_polylines(
     )
     of_beam = np.zeros(angles.size, bool)
     of_beam[(beam[explained] + start) % angles.size] = True
+    if known is not None:
+        of_beam = known.spread(of_beam, False)
     return ScanPolylines(vertices, polyline, closed, of_beam)
 
 

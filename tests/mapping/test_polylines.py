@@ -410,12 +410,23 @@ def distance_of_rays(ends, segments):
         ({"miss": math.inf}, "miss"),
         ({"max_gap": -1.0}, "max_gap"),
         ({"max_gap": math.nan}, "max_gap"),
-        ({"ranges": np.array([1.0, math.nan])}, "NaN"),
         ({"ranges": np.ones(3)}, "length"),
-        ({"angles": np.zeros(2)}, "increase"),
+        ({"angles": np.array(["a", "b"])}, "real numbers"),
     ],
 )
 def test_errors(change, message):
     arguments = {"angles": np.array([0.0, 0.1]), "ranges": np.ones(2), "max_vertices": 4} | change
     with pytest.raises(ValueError, match=message):
         extract_polylines(**arguments)
+
+
+def test_unknown_beams_are_left_out_in_any_order():
+    angles = np.linspace(-0.8, 0.8, 161)
+    ranges = np.minimum(2.0 / np.cos(angles - 0.7), 2.0 / np.cos(angles + 0.7))
+    gone = np.random.default_rng(0).random(161) < 0.2
+    expected = extract_polylines(angles[~gone], ranges[~gone], 3)
+    for values in (np.where(gone, np.nan, ranges), np.where(gone, 0.0, ranges)):
+        made = extract_polylines(angles[::-1], values[::-1], 3)
+        np.testing.assert_array_equal(made.vertices, expected.vertices)
+        np.testing.assert_array_equal(made.explained[::-1][~gone], expected.explained)
+        assert not made.explained[::-1][gone].any()
