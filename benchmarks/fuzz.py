@@ -369,7 +369,7 @@ def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[
         return env, None, result
     found = exact.check(env)
     result |= {"seen": round(100.0 * found.share, 2), "left": round(found.area / found.limit, 3),
-               "drivable": round(found.drivable / found.limit, 3), "open edges": env.exploration.chains.count,
+               "drivable": round(found.drivable / found.limit, 3), "open edges": len(env.exploration.chains.id),
                "place": None if found.place is None else [round(float(v), 3) for v in found.place]}  # fmt: skip
     if outcome == "ended":
         result["kind"] = _verdict(env, found, decisions, result)
@@ -530,7 +530,7 @@ class Child:
     def play(self, number: int) -> dict[str, Any]:
         """The result of a case."""
         if self._process is None or self._process.poll() is not None:
-            self._errors = self._log.open("w", encoding="utf-8")
+            self._errors = self._log.open("a", encoding="utf-8")
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True
             )
@@ -544,9 +544,8 @@ class Child:
                 found: dict[str, Any] = json.loads(line[len(_MARK) :])
                 return found
         code = process.wait()
-        trace = [
-            line.strip() for line in self._log.read_text(encoding="utf-8").splitlines() if line.startswith("  File")
-        ]
+        said = self._log.read_text(encoding="utf-8").splitlines()[-40:]
+        trace = [*said[-1:], *(line.strip() for line in said if line.startswith("  File"))]
         kind = "hang" if code == -signal.SIGXCPU else "crash"
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         case: dict[str, Any] = {"case": number}
