@@ -29,15 +29,15 @@ DOOR = 0.5
 def read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Beam angles (n,), ranges (scans, n) and laser poses (scans, 3) of a log."""
     log = read_log(path)
-    return log.angles, log.ranges, log.poses
+    return log.angles[0], np.array(log.ranges), log.poses
 
 
 def open_stretches(made: LogMap, log: LaserLog, max_range: float) -> list[float]:
     """Lengths of the stretches of segments that beams pass, m, longest first."""
-    turned = (log.poses[:, 2:] + log.angles).ravel()
+    turned = np.concatenate([pose[2] + angles for pose, angles in zip(log.poses, log.angles, strict=True)])
     ray = np.stack([np.cos(turned), np.sin(turned)], axis=1)
-    origin = np.repeat(log.poses[:, :2], log.angles.size, axis=0)
-    reach = np.minimum(log.ranges, max_range).ravel()
+    origin = np.repeat(log.poses[:, :2], [angles.size for angles in log.angles], axis=0)
+    reach = np.minimum(np.concatenate(log.ranges), max_range)
     end = origin + reach[:, None] * ray
     returned = reach < max_range
     found = []
@@ -65,7 +65,7 @@ def cost(log: LaserLog, sensor: SensorConfig, config: MappingConfig) -> float:
     line_map, covariance, spent = LineMap(config, sensor), np.diag([0.02, 0.02, math.radians(0.3)]) ** 2, 0.0
     for k, (ranges, pose) in enumerate(zip(log.ranges, log.poses, strict=True)):
         begin = time.process_time()
-        line_map.insert(extract_lines(log.angles, ranges, sensor, config), pose, covariance)
+        line_map.insert(extract_lines(log.angles[k], ranges, sensor, config), pose, covariance)
         spent += time.process_time() - begin if k else 0.0
     return 1e3 * spent / max(len(log.poses) - 1, 1)
 
@@ -77,7 +77,7 @@ def main() -> None:
     arguments = parser.parse_args()
     head = [
         "log", "check", "scans", "points", "lines of scans", "lines", "compression", "segments", "fragments",
-        "on lines", "distance", "distance, all", "open stretches", "ms a scan",
+        "on lines", "distance", "distance, all", "misfit", "open stretches", "ms a scan",
     ]  # fmt: skip
     rows = []
     for path in arguments.logs:
@@ -102,6 +102,7 @@ def main() -> None:
                     f"{100 * made.on_line.mean():.1f} %",
                     f"{1e3 * made.median_distance:.1f} mm",
                     f"{1e3 * np.median(made.distances):.1f} mm",
+                    f"{100 * made.misfit:.1f} %",
                     f"{len(gaps)}" + (f", up to {gaps[0]:.2f} m" if gaps else ""),
                     f"{spent:.3f}",
                 ]
@@ -111,6 +112,7 @@ def main() -> None:
             save_map(made, arguments.pictures / f"{name}.png", name=name)
     print(format_table(head, rows))
     print("distance: median, from the points on lines (all: from all points) to the nearest segment")
+    print("misfit: beams that pass through a wall of those that meet one, median over the scans")
     print(f"open stretches: of {DOOR} m or more")
 
 

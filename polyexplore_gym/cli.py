@@ -209,8 +209,9 @@ class Eval:
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
-    Logs are CARMEN (FLASER or ROBOTLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b)
-    and poses (n, 3), in rad and m, and optionally max_range and pose_covariance, (3, 3) or (n, 3, 3).
+    Logs are ROS 1 bags, ROS 2 bags (the folder, or a .db3 or .mcap file; both need the extra "logs"), CARMEN (FLASER,
+    ROBOTLASER1 or RAWLASER1 messages, plain or .gz), or .npz with the arrays angles (b,), ranges (n, b) and poses
+    (n, 3), in rad and m, and optionally max_range, pose_covariance, odometry, times and time_increment.
     """
 
     log: tyro.conf.Positional[Path]
@@ -225,6 +226,10 @@ class Linemap:
     """Standard deviation of the beam angle noise, degrees."""
     range_floor: float = 0.01
     """Smallest standard deviation of range assumed in the fit, m."""
+    topic: str | None = None
+    """Topic of the scans in a bag (default: the one with the most scans)."""
+    trajectory_in: Path | None = None
+    """File of poses of the laser, in the TUM format, to be used instead of those in the log."""
     field_of_view: float | None = None
     """FLASER only: angle between the first and the last beam, degrees (default: 180, less a step if beams are even)."""
     sigma_xy: float = 0.02
@@ -429,6 +434,8 @@ def linemap(options: Linemap) -> int:
     with tqdm(total=size, desc="read", unit="B", unit_scale=True, dynamic_ncols=True) as bar:
         log = read_log(
             options.log,
+            topic=options.topic,
+            trajectory=options.trajectory_in,
             field_of_view=None if fov is None else math.radians(fov),
             watch=lambda done: bar.update(done - bar.n),
         )
@@ -442,7 +449,9 @@ def linemap(options: Linemap) -> int:
     if len(log.broken) > SHOWN:
         _say(f"left out: {len(log.broken) - SHOWN} more")
     for message, number in log.unread.items():
-        _say(f"left out: {number} {message} scans; the FLASER scans are read")
+        _say(f"left out: {number} {message} scans; the {log.read} scans are read")
+    for note in log.notes:
+        _say(f"note: {note}")
     sensor = sensor_of(log, options.max_range, options.sigma_range, math.radians(options.sigma_angle))
     result = map_log(
         log,
@@ -693,15 +702,19 @@ def _map_files(options: Linemap) -> list[Path]:
 def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:
     points, lines = len(made.points), made.rho.size
     on_lines = f"{100 * made.on_line.mean():.1f} % on lines" if points else "none on lines"
+    fewest, most = (limit(angles.size for angles in log.angles) for limit in (min, max))
+    beams = str(most) if fewest == most else f"{fewest} to {most}"
     return (
-        f"{name}: {len(log)} scans of {log.angles[0].size} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"{name}: {len(log)} scans of {beams} beams, {len(made.path)} used, {len(log.broken)} broken\n"
+        f"  poses         {log.poses_are}{f': {log.why}' if log.why else ''}\n"
         f"  points        {points} ({on_lines})\n"
         f"  lines         {lines} with {len(made.segments)} segments (single scans: {made.lines_of_scans}); "
         f"{len(made.fragments)} fragments\n"
         f"  compression   {f'{100 * made.compression:.2f} % (lines to points)' if lines else '-'}\n"
         f"  distance      {f'{1e3 * made.median_distance:.1f} mm' if lines else '-'} "
         "(median, from the points on lines to the nearest segment)\n"
-        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut"
+        f"  seen through  {made.contradicted} segments and {made.fragments_contradicted} fragments, dropped or cut\n"
+        f"  misfit        {100 * made.misfit:.1f} % (median over the scans of the beams that pass through walls)"
     )
 
 

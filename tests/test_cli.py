@@ -241,6 +241,56 @@ def test_a_log_becomes_a_map(tmp_path, capsys):
     assert 0 < fewer["points"] < data["points"] / 4
 
 
+def test_what_a_log_is_and_that_its_walls_do_not_fit_is_told(tmp_path, capsys):
+    """The room again and again, but the poses say that the robot went on: no warning without a reason."""
+    log = carmen(tmp_path / "room.log")
+    assert main(["linemap", str(log), "--out", str(tmp_path / "a.json")]) == 0
+    captured = capsys.readouterr()
+    assert "poses         unknown: odom_x odom_y odom_theta do not move" in captured.out
+    assert "misfit        0.0 %" in captured.out
+    assert "warning" not in captured.err
+    lines = []
+    for k, line in enumerate(log.read_text().splitlines() * 3):
+        fields = line.split()
+        x, y, heading = 1 + 0.2 * k, 2 + 0.3 * (-1) ** k, float(fields[185]) + 0.3 * (-1) ** k
+        fields[183:189] = map(str, (x, y, heading, x, y, heading))
+        lines += [f"ODOM {x} {y} {heading} 0 0 0 {k + 1} h {k + 1}", " ".join([*fields[:189], str(k + 1), "h", "0"])]
+    log.write_text("\n".join(lines))
+    assert main(["linemap", str(log), "--out", str(tmp_path / "a.json")]) == 0
+    captured = capsys.readouterr()
+    assert "poses         odometry: x y theta go with odom_x odom_y odom_theta and the ODOM lines" in captured.out
+    assert "warning: walls that were seen again do not fit: in half of the scans" in captured.err
+    assert "raw odometry" in captured.err
+    # a trajectory beside it that is right
+    rows = [(k + 1, 1, 2, 0, 0, 0, np.sin(0.125 * np.pi * k), np.cos(0.125 * np.pi * k)) for k in range(24)]
+    np.savetxt(tmp_path / "poses.txt", rows)
+    assert (
+        main(["linemap", str(log), "--trajectory-in", str(tmp_path / "poses.txt"), "--out", str(tmp_path / "b.json")])
+        == 0
+    )
+    captured = capsys.readouterr()
+    assert "warning" not in captured.err
+    assert f"poses         corrected: poses of {tmp_path / 'poses.txt'}" in captured.out
+    assert len(json.loads((tmp_path / "b.json").read_text())["lines"]) == 4
+
+
+def test_a_bag_becomes_a_map(tmp_path, capsys):
+    pytest.importorskip("rosbags")
+    sys.path.insert(0, str(Path(__file__).parent / "mapping"))
+    from bags import drive
+
+    for kind in ("bag", "mcap"):
+        path = drive(tmp_path / "round", kind)
+        assert main(["linemap", str(path), "--topic", "/scan", "--out", str(tmp_path / "a.json")]) == 0
+        captured = capsys.readouterr()
+        assert "20 scans of 180 beams, 20 used, 0 broken" in captured.out
+        assert "poses         corrected: /tf corrects the frame odom in map" in captured.out
+        assert len(json.loads((tmp_path / "a.json").read_text())["lines"]) == 4
+    assert main(["linemap", str(path), "--topic", "/scans", "--out", str(tmp_path / "b.json")]) == 2
+    assert "topic /scans: not one of laser scans; those are: /scan" in capsys.readouterr().err
+    assert not (tmp_path / "b.json").exists()
+
+
 def test_many_broken_lines_are_counted(tmp_path, capsys):
     log = carmen(tmp_path / "room.log", *["FLASER 181 1.0"] * 25)
     assert main(["linemap", str(log), "--out", str(tmp_path / "a.json")]) == 0
@@ -253,7 +303,7 @@ def test_many_broken_lines_are_counted(tmp_path, capsys):
 def test_a_log_that_cannot_be_read_leaves_nothing_behind(tmp_path, capsys):
     (tmp_path / "empty.log").touch()
     (tmp_path / "film.log").write_bytes(bytes(range(256)) * 50)
-    for name, reason in (("empty.log", "is empty"), ("film.log", "no usable FLASER or ROBOTLASER1 message")):
+    for name, reason in (("empty.log", "is empty"), ("film.log", "no usable FLASER, ROBOTLASER1 or RAWLASER1")):
         assert main(["linemap", str(tmp_path / name), "--out", str(tmp_path / "maps")]) == 2
         last = capsys.readouterr().err.splitlines()[-1]
         assert last.startswith(f"error: {tmp_path / name}: {reason}")

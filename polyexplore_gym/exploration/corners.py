@@ -30,10 +30,14 @@ _FREE = 2.0
 """Stands for the largest sine where a vertex serves every direction past its corner."""
 OPEN_SPACE = 4.0
 """Stands for the largest sine of a vertex in the open, without a corner."""
+GATE = 5.0
+"""The same, in a narrow passage, where a hand's breadth decides."""
 TRAIL = 8.0
 """The same, for a place where the robot has driven: no wall refutes that."""
-_GATE = (0.0, 0.6, -0.6, 1.06, -1.06, 1.6, -1.6)
+_AXIS = (0.0, 0.7, -0.7, 1.3, -1.3)
 """Where vertices stand on the axis of a narrow passage, in radii from its middle: the way in must be straight."""
+_NARROW = 2.32
+"""Passages narrower than this, in radii, need vertices on their axis; wider ones are passed from corner to corner."""
 
 
 class Shapes(NamedTuple):
@@ -145,13 +149,12 @@ def _in_narrows(ex, ey, ux, uy, walls, tol):
 
 @njit(cache=True)
 def _across(ex, ey, walls, tol):
-    """What faces a wall end across a passage too narrow for the spare: (x, y, found), the nearest point of it.
+    """What faces a wall end across a narrow passage: (x, y, found), the nearest point of it.
 
     It lies at least two `tol.need` away, and the middle between is nearer to no other wall.
     """
     segments = walls.segments
-    widest = 2.0 * (tol.radius + tol.spare)
-    best = widest
+    best = widest = _NARROW * tol.radius
     fx = 0.0
     fy = 0.0
     found = False
@@ -265,7 +268,7 @@ def corner_vertices(ends, walls, scans, waited, since, tol):
         d = norm(fx - ex, fy - ey)
         ux = -(fy - ey) / d
         uy = (fx - ex) / d
-        for k in _GATE:
+        for k in _AXIS:
             x = 0.5 * (ex + fx) + k * tol.radius * ux
             y = 0.5 * (ey + fy) + k * tol.radius * uy
             if clearance(x, y, walls, tol.reach) < tol.sweep:
@@ -279,7 +282,7 @@ def corner_vertices(ends, walls, scans, waited, since, tol):
             shape.anchor[count, 1] = ey
             shape.first[count] = 0.0
             shape.second[count] = 0.0
-            shape.limit[count] = OPEN_SPACE
+            shape.limit[count] = GATE
             count += 1
     return (
         out[:count].copy(),
@@ -384,7 +387,7 @@ def distinct(candidates, forms, position, shape, kind, n_vertices, tol):
     for i in range(m):
         x = candidates[i, 0]
         y = candidates[i, 1]
-        if forms.limit[i] == OPEN_SPACE:  # in a narrow passage, where a hand's breadth decides
+        if forms.limit[i] == GATE:
             for v in range(n_vertices):
                 if kind[v] == CORNER and norm(position[v, 0] - x, position[v, 1] - y) < tol.still:
                     keep[i] = False

@@ -528,10 +528,11 @@ def link(segments, sigma, walls, tol):
 @njit(cache=True)
 def _to_wall(x, y, walls, tol):
     """How far an opening goes on beyond the end of its open edges: to the wall there, no farther than walls cover."""
-    best = tol.cover + tol.join
+    limit = tol.cover + tol.join
+    best = limit
     for w in range(walls.shape[0]):
         best = min(best, point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]))
-    return best
+    return best if best < limit else 0.0
 
 
 @njit(cache=True)
@@ -546,11 +547,17 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
         total = 0.0
         gaps = 0.0
         per_kind = np.zeros(4)
+        x0 = y0 = math.inf
+        x1 = y1 = -math.inf
         for e in range(offsets[q], offsets[q + 1]):
             i = order[e]
             size = math.hypot(segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1])
             total += size
             per_kind[kinds[i]] += size
+            x0 = min(x0, segments[i, 0], segments[i, 2])
+            x1 = max(x1, segments[i, 0], segments[i, 2])
+            y0 = min(y0, segments[i, 1], segments[i, 3])
+            y1 = max(y1, segments[i, 1], segments[i, 3])
             out.visits[q] = max(out.visits[q], visits[i])
             if e > offsets[q]:
                 k = order[e - 1]
@@ -563,8 +570,9 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
         out.ends[q, 2] = segments[last, 2]
         out.ends[q, 3] = segments[last, 3]
         out.length[q] = total
-        out.width[q] = total + gaps
-        if total < tol.gap:  # else wide enough
+        # Round the tip of a shadow a chain may be longer than it is wide.
+        out.width[q] = min(total + gaps, math.hypot(x1 - x0, y1 - y0))
+        if out.width[q] < tol.gap:  # else wide enough
             out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
             out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
             out.width[q] = min(out.width[q], 2.0 * total)  # crumbs far apart are no opening

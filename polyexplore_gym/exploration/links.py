@@ -217,11 +217,12 @@ def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
         if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
             want = blocked_want[e] - tol.still
             keep[e] = not _hit(ax, ay, bx, by, norm(bx - ax, by - ay), want, walls, discs)
-    for u in range(n_vertices):
-        if links.degree[u] == 0:
-            continue
+    for u in range(n_vertices if walls.shape[0] > 0 else 0):
         ax = position[u, 0]
         ay = position[u, 1]
+        far = tol.last_leg
+        if links.degree[u] == 0 or ax < x0 - far or ax > x1 + far or ay < y0 - far or ay > y1 + far:
+            continue
         h = links.first[u]
         while h < links.first[u] + links.degree[u]:
             v = links.target[h]
@@ -296,11 +297,13 @@ def connect(fresh, vertices, n_vertices, walls, pieces, tol):
         ux = position[u, 0]
         uy = position[u, 1]
         for v in range(n_vertices):
-            if kind[v] < 0 or rank[v] > i or v == u:
-                continue
             dx = position[v, 0] - ux
             dy = position[v, 1] - uy
+            if abs(dx) > tol.last_leg or abs(dy) > tol.last_leg or kind[v] < 0 or rank[v] > i or v == u:
+                continue
             d = norm(dx, dy)
+            if d > (tol.last_leg if kind[u] == LEAF or kind[v] == LEAF else tol.leg):
+                continue
             if d > tol.trail_edge and max(shape.limit[u], shape.limit[v]) >= TRAIL:
                 continue
             d1 = d if d > 0.0 else 1.0

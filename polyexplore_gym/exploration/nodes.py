@@ -89,11 +89,20 @@ def place(which, edges, front, walls, pieces, tol):
 
 @njit(cache=True)
 def _joins(x, y, chain, vertices, seen, walls, pieces, tol):
-    """Whether the disc can go straight from (x, y) to a vertex in `seen`."""
-    for v in range(seen.size):
+    """Whether the disc can go straight from (x, y) to a vertex in `seen`; to far ones if there is none near."""
+    near = tol.way_point
+    some = False
+    for v in range(2 * seen.size):
+        far = v >= seen.size
+        if far and some:
+            break
+        v = v % seen.size
         if not seen[v] or vertices.kind[v] < 0:
             continue
         vx, vy = vertices.position[v]
+        if (abs(vx - x) > near or abs(vy - y) > near) != far:
+            continue
+        some = True
         if crossing_free(x, y, vx, vy, pieces, chain, chain, tol.slack, tol.slack) and sweep_free(
             x, y, vx, vy, walls, tol.sweep
         ):
@@ -158,9 +167,7 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
         else:
             # Only from the known side is the edge a window into the unknown.
             ahead = (mx - vx) * nx + (my - vy) * ny
-            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(
-                vx, vy, tx, ty, walls, pieces, chain, chain, tol
-            )
+            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(vx, vy, tx, ty, walls, pieces, chain, chain, tol)
         if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, scans, tol):
             best = d
             bx = vx

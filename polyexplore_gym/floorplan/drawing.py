@@ -5,8 +5,8 @@ A drawing is strokes: open or closed lines, each with the names of its layer and
 
 - outline: closed lines are the outline of the floor, of obstacles in it, of floor in those, and so on; lines whose
   ends meet within `snap` make closed lines.
-- areas: closed lines are the outline of walls, of what they enclose, of obstacles in that. The floor is what the
-  walls enclose.
+- areas: closed lines are the outline of walls, of what they enclose, of obstacles in that; where two overlap, the
+  smaller is a wall. The floor is what the walls enclose.
 - lines: all lines are walls of a thickness, whatever their ends do. The floor is what they enclose.
 
 Doors are drawn as symbols over or beside the wall. Each is opened by the smallest rectangle round it, which is made
@@ -115,12 +115,12 @@ def rooms_of(drawing: Drawing, options: PlanFileConfig) -> list[shapely.Polygon]
     thickness = WALL_THICKNESS if options.wall_thickness is None else options.wall_thickness
     openings = [opening for symbol in _symbols(doors, options.snap) if (opening := _opening(symbol, thickness))]
     if options.walls == "outline":
-        rooms = _even_odd(_rings(walls, options.snap))[0]
+        rooms = _outlined(_rings(walls, options.snap))
         if openings:
             rooms = list(polygons(shapely.union_all([*rooms, *openings])))
         return rooms
     if options.walls == "areas":
-        solid = shapely.union_all(_even_odd(_rings(walls, options.snap))[0])
+        solid = _solid(_rings(walls, options.snap))
     else:
         if thickness <= 0:
             raise InvalidFloorPlanError("wall_thickness 0: lines that are walls need a thickness (--wall-thickness)")
@@ -175,7 +175,8 @@ def _rings(strokes: Sequence[Stroke], snap: float) -> list[shapely.Polygon]:
             x, y = ring[0]
             reason = str(error).removeprefix("exterior").lstrip(", :")
             raise InvalidFloorPlanError(f"the closed line that begins at ({x:.3f}, {y:.3f}): {reason}") from error
-    return found
+    # Lines that were drawn twice count once.
+    return list({shapely.normalize(ring).wkb: ring for ring in found}.values())
 
 
 def _chains(lines: Sequence[np.ndarray], snap: float) -> list[np.ndarray]:
@@ -235,28 +236,43 @@ def _open_ends(ends: np.ndarray, alone: Sequence[int], snap: float) -> str:
         for gap, i in gaps[:3]
     ]
     more = f" and {len(alone) - 3} more" if len(alone) > 3 else ""
+    remedy = f"a larger snap (now {snap:g} m, --snap) closes small gaps; " if gaps[0][0] < 0.5 else ""
     return (
-        f"lines do not close: ends at {'; at '.join(shown)}{more}. A larger snap (now {snap:g} m, --snap) closes them; "
-        "if lines are walls, say walls='lines' (--walls lines)"
+        f"lines do not close: ends at {'; at '.join(shown)}{more}; {remedy}if lines are walls, say walls='lines' "
+        "(--walls lines)"
     )
 
 
-def _even_odd(rings: Sequence[shapely.Polygon]) -> tuple[list[shapely.Polygon], list[shapely.Polygon]]:
-    """Areas within an odd and within an even number of rings; rings may not cross."""
-    order = sorted(rings, key=lambda ring: -ring.area)
-    tree = shapely.STRtree(order)
-    inner, outer = tree.query(order, predicate="covered_by")
-    depth = np.bincount(inner[inner != outer], minlength=len(order))
-    a, b = tree.query(order, predicate="overlaps")
+def _outlined(rings: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Areas within an odd number of rings, which may not cross."""
+    a, b = shapely.STRtree(rings).query(rings, predicate="overlaps")
     if len(a):
-        place = order[int(a[0])].intersection(order[int(b[0])]).representative_point()
-        raise InvalidFloorPlanError(f"closed lines overlap at ({place.x:.3f}, {place.y:.3f})")
-    areas: tuple[list[shapely.Polygon], list[shapely.Polygon]] = ([], [])
-    for i, ring in enumerate(order):
-        mine = inner[(outer == i) & (inner != i)]
-        children = [order[int(j)] for j in mine if depth[j] == depth[i] + 1]
-        area = ring.difference(shapely.union_all(children)) if children else ring
-        areas[int(depth[i] % 2)].extend(polygons(area))
+        place = rings[int(a[0])].intersection(rings[int(b[0])]).representative_point()
+        raise InvalidFloorPlanError(
+            f"closed lines overlap at ({place.x:.3f}, {place.y:.3f}), so they are no outline; if they are walls, say "
+            "walls='areas' (--walls areas)"
+        )
+    return _odd(rings)
+
+
+def _solid(rings: Sequence[shapely.Polygon]) -> shapely.Geometry:
+    """Walls: areas within an odd number of rings, and all of a ring that overlaps a larger one, such as a pillar."""
+    order = sorted(rings, key=lambda ring: -ring.area)
+    a, b = shapely.STRtree(order).query(order, predicate="overlaps")
+    loose = set(a[a > b].tolist())
+    return shapely.union_all([*_odd([r for i, r in enumerate(order) if i not in loose]), *(order[i] for i in loose)])
+
+
+def _odd(rings: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Areas within an odd number of rings, of which none overlaps another but by lying in it."""
+    order = sorted(rings, key=lambda ring: -ring.area)
+    inner, outer = shapely.STRtree(order).query(order, predicate="covered_by")
+    depth = np.bincount(inner[inner != outer], minlength=len(order))
+    areas: list[shapely.Polygon] = []
+    for i in np.flatnonzero(depth % 2 == 0):
+        children = [order[int(j)] for j in inner[(outer == i) & (inner != i)] if depth[j] == depth[i] + 1]
+        area = order[i].difference(shapely.union_all(children)) if children else order[i]
+        areas.extend(polygons(area))
     return areas
 
 

@@ -155,7 +155,7 @@ def _placing(units: object, points: np.ndarray) -> Any:
     if units != DEGREES:
         factor = metres(1.0 if units is None else units)
         degrees = bool((np.abs(points) <= (180.0, 90.0)).all())
-        if units is None and degrees and float((high - low).max()) < SMALL_SPAN:
+        if units is None and degrees and 0 < float((high - low).max()) < SMALL_SPAN:
             raise InvalidFloorPlanError(
                 f"GeoJSON: the plan spans {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m, which is no building; if "
                 "the coordinates are longitude and latitude, say units='deg' (--units deg)"

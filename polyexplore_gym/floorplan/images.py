@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ MAX_PIXELS = 100_000_000
 """Largest image read."""
 MAX_BYTES = 1_000_000_000
 """Largest image file read."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 _COLOURS = {b"P1": 1, b"P2": 1, b"P3": 3, b"P4": 1, b"P5": 1, b"P6": 3}
 _NUMBER = re.compile(rb"(?:\s|#[^\n]*\n)*(\d{1,9})(?=\s)")
 
@@ -124,9 +126,9 @@ def _others(data: bytes) -> np.ndarray:
     size = _declared_size(data)
     if size is not None:
         _check_size(*size)
-    # OpenCV fills a truncated file's missing rows without a word: look for the end.
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and b"IEND\xaeB`\x82" not in data:
-        raise _ImageError("the file is truncated")
+    # OpenCV fills the missing rows of a truncated file, and those of a damaged one, without a word.
+    if data[:8] == _PNG:
+        _check_png(data)
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-1024:]:
         raise _ImageError("the file is truncated")
     try:
@@ -145,10 +147,26 @@ def _others(data: bytes) -> np.ndarray:
     return values * np.float32(255.0 / full)
 
 
+def _check_png(data: bytes) -> None:
+    """Every chunk of a png has a checksum; the last is IEND."""
+    position = 8
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4])
+        end = position + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4]):
+            raise _ImageError("damaged: a checksum is wrong")
+        if data[position + 4 : position + 8] == b"IEND":
+            return
+        position = end + 4
+    raise _ImageError("the file is truncated")
+
+
 def _declared_size(data: bytes) -> tuple[int, int] | None:
     """Width and height by the header of a png, bmp or jpg, before it is unpacked; None: another format."""
     try:
-        if data[:8] == b"\x89PNG\r\n\x1a\n":
+        if data[:8] == _PNG:
             return struct.unpack(">II", data[16:24])
         if data[:2] == b"BM":
             width, height = struct.unpack("<ii", data[18:26])

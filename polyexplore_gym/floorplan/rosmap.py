@@ -435,48 +435,50 @@ class Reached:
         best = 1 + int(np.argmax(areas))
         largest = int(areas[best - 1])
         if self._disc <= 0:
-            at = tuple(np.argwhere(labels == best)[0].tolist())
+            at = divmod(int((labels == best).argmax()), labels.shape[1])
             return _LostPixels(largest, at, 0.0, at, 0.0)
         fine = self._fine
         inside = labels == best
         coarse = self._distance[1:-1, 1:-1][::fine, ::fine]
         # The deepest pixel of the part stands for it.
-        deepest = np.where(inside, coarse, -1.0).argmax()
-        at = tuple(int(i) for i in np.unravel_index(deepest, inside.shape))
+        at = divmod(int(np.where(inside, coarse, -1.0).argmax()), inside.shape[1])
         row, column = at[0] * fine + 1, at[1] * fine + 1
-        home = np.unravel_index(np.where(self._centres, self._distance, -1.0).argmax(), self._centres.shape)
+        home = divmod(int(np.where(self._centres, self._distance, -1.0).argmax()), self._centres.shape[1])
+        steps = STEPS if self._free.size <= _FINE else STEPS // 4
 
         @cache
         def shares(step: int) -> tuple[bool, bool]:
             """Whether a disc of that size gets to the lost part, and whether it keeps most."""
-            mask = (self._distance >= step / STEPS * self._disc * fine).astype(np.uint8)
-            count, found = cv2.connectedComponents(mask, connectivity=4)
-            areas = np.bincount(found.ravel(), minlength=count)
+            mask = (self._distance >= step / steps * self._disc * fine).astype(np.uint8)
+            _, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+            areas = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
             main = found[home]
             reaches = bool(mask[row, column]) and found[row, column] == main
             return reaches, keeps_most([areas[main], *np.delete(areas, [0, main])])
 
-        step = last_true(lambda step: shares(step)[0])
+        step = last_true(lambda step: shares(step)[0], steps)
         return _LostPixels(
             largest,
             at,
-            (step + 0.5) / STEPS * self._disc if step else 0.0,
-            self._stopped((row, column), (step + 1) / STEPS),
-            last_true(lambda step: shares(step)[1]) / STEPS * self._disc,
+            (step + 0.5) / steps * self._disc if step else 0.0,
+            self._stopped(home, (row, column), (step + 1) / steps * self._disc) if step else at,
+            last_true(lambda step: shares(step)[1], steps) / steps * self._disc,
         )
 
-    def _stopped(self, target: tuple[int, int], share: float) -> tuple[int, int]:
-        """The pixel of the target's side that is nearest to where a slightly smaller disc gets."""
+    def _stopped(self, home: tuple[int, int], target: tuple[int, int], disc: float) -> tuple[int, int]:
+        """The pixel on the target's side that is nearest to where a disc gets that is just too large to pass."""
         import cv2
 
-        mask = (self._distance >= share * self._disc * self._fine).astype(np.uint8)
+        mask = (self._distance >= disc * self._fine).astype(np.uint8)
         mask[target] = 1
         _, found = cv2.connectedComponents(mask, connectivity=4)
-        main = found == found[np.unravel_index(self._centres.argmax(), self._centres.shape)]
-        off = cv2.distanceTransform((~main).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        gap = np.where(found == found[target], off, np.inf)
-        row, column = np.unravel_index(gap.argmin(), gap.shape)
-        return int(row - 1) // self._fine, int(column - 1) // self._fine
+        top, bottom, left, right = _box(found == found[target])
+        margin = int(4 * self._disc * self._fine) + 4
+        top, left = max(top - margin, 0), max(left - margin, 0)
+        part = found[top : bottom + margin, left : right + margin]
+        off = cv2.distanceTransform((part != found[home]).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        row, column = np.unravel_index(np.where(part == found[target], off, np.inf).argmin(), part.shape)
+        return (int(row) + top - 1) // self._fine, (int(column) + left - 1) // self._fine
 
 
 def component(mask: np.ndarray, seed: tuple[int, int] | None) -> np.ndarray | None:
@@ -564,9 +566,18 @@ def _deepest(region: np.ndarray, grid: _Grid) -> tuple[float, float]:
 
 
 def _simplify(polygon: shapely.Polygon, tolerance: float) -> shapely.Polygon:
-    """Douglas-Peucker that keeps the rings apart, and all of them; pixels."""
+    """Douglas-Peucker that keeps the rings apart, and all of them, small obstacles as they are; pixels."""
+    if not tolerance:
+        return polygon
     # A small factor over a whole pixel: a staircase of single pixels becomes a straight line.
-    return shapely.simplify(polygon, 1.001 * tolerance, preserve_topology=True) if tolerance else polygon
+    simple = shapely.simplify(polygon, 1.001 * tolerance, preserve_topology=True)
+    x0, y0, x1, y1 = shapely.bounds(shapely.get_rings(polygon)[1:]).T
+    small = np.maximum(x1 - x0, y1 - y0) <= 3 * tolerance
+    if small.any() and len(simple.interiors) == len(small):
+        rings = zip(small, polygon.interiors, simple.interiors, strict=True)
+        whole = shapely.Polygon(simple.exterior, [before if keep else after for keep, before, after in rings])
+        return whole if whole.is_valid else simple
+    return simple
 
 
 def _too_many(outline: shapely.Polygon, count: int, tolerance: float, resolution: float) -> str:
@@ -663,7 +674,10 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     origin = data["origin"]
     if not isinstance(origin, list) or len(origin) not in (2, 3):
         raise InvalidFloorPlanError(f"origin {shorten(origin)}: expected [x, y, yaw]")
-    fields["origin"] = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    x, y, yaw = (*(_number(v, "origin") for v in origin), 0.0)[:3]
+    if abs(yaw) > 2 * math.pi:
+        raise InvalidFloorPlanError(f"origin {shorten(origin)}: the yaw is in radians, so at most 2 pi")
+    fields["origin"] = (x, y, yaw)
     return fields
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -13,18 +15,21 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
 from polyexplore_gym.floorplan.drawing import MAX_POINTS, MAX_STROKES, Drawing, Stroke
 from polyexplore_gym.floorplan.model import FloorPlan
 from polyexplore_gym.floorplan.units import guess, metres
 from polyexplore_gym.floorplan.validation import shorten
 from polyexplore_gym.optional import require
 
+_SVG = "{http://www.w3.org/2000/svg}"
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _HREF = "{http://www.w3.org/1999/xlink}href"
 _UNITS = "data-units"
 """Attribute of the root by which our own files say metres a user unit."""
-_NOT_DRAWN = {"defs", "clipPath", "mask", "marker", "pattern", "symbol", "metadata", "style", "script", "title", "desc"}
+_NOT_DRAWN = {"defs", "clipPath", "mask", "marker", "pattern", "symbol"}
+# What is no wall and not worth a word.
+_NO_WALLS = {"text", "tspan", "image", "foreignObject", "style", "script", "title", "desc", "metadata", "view"}
 _GROUPS = {"svg", "g", "a", "switch"}
 _DEPTH = 50
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -58,7 +63,8 @@ def read(path: Path, units: str | None, tolerance: float) -> Drawing:
     strokes: list[Stroke] = []
     names: set[str] = set()
     points = 0
-    for element, matrix, tags, where in _shapes(root):
+    others: Counter[str] = Counter()
+    for element, matrix, tags, where in _shapes(root, others):
         try:
             lines = list(_lines(element, matrix, tolerance / factor))
         except InvalidFloorPlanError:
@@ -73,6 +79,9 @@ def read(path: Path, units: str | None, tolerance: float) -> Drawing:
             strokes.append(Stroke(line * (factor, -factor), closed, tags))
     if stated is None:
         raise InvalidFloorPlanError(_no_units(strokes))
+    if others:
+        shown = ", ".join(f"{count} {kind[:40]}" for kind, count in sorted(others.items())[:8])
+        warnings.warn(f"{path}: not read: {shown}", FloorPlanWarning, stacklevel=2)
     return Drawing(strokes, frozenset(names))
 
 
@@ -94,8 +103,11 @@ def _tag(element: ElementTree.Element) -> str:
 _Shape = tuple[ElementTree.Element, np.ndarray, frozenset[str], str]
 
 
-def _shapes(root: ElementTree.Element) -> Iterator[_Shape]:
-    """Each shape that is shown, with its matrix (3, 3), its names, and what it is called in messages."""
+def _shapes(root: ElementTree.Element, others: Counter[str]) -> Iterator[_Shape]:
+    """Each shape that is shown, with its matrix (3, 3), its names, and what it is called in messages.
+
+    Elements of SVG that are not known are counted in `others`.
+    """
     from svgpathtools.parser import parse_transform
 
     by_id = {element.get("id"): element for element in root.iter() if element.get("id")}
@@ -104,7 +116,7 @@ def _shapes(root: ElementTree.Element) -> Iterator[_Shape]:
         element: ElementTree.Element, matrix: np.ndarray, tags: frozenset[str], style: Mapping[str, str], depth: int
     ) -> Iterator[_Shape]:
         tag = _tag(element)
-        if not tag or tag in _NOT_DRAWN or depth > _DEPTH:
+        if not tag or tag in _NOT_DRAWN or tag in _NO_WALLS or depth > _DEPTH:
             return
         style = {**style, **_style(element)}
         if style.get("display") == "none":
@@ -112,7 +124,9 @@ def _shapes(root: ElementTree.Element) -> Iterator[_Shape]:
         where = f"{tag} {element.get('id')!r}" if element.get("id") else tag
         if element.get("transform"):
             try:
-                matrix = matrix @ np.asarray(parse_transform(element.get("transform")), dtype=np.float64)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")  # svgpathtools only warns of transforms that it does not know
+                    matrix = matrix @ np.asarray(parse_transform(element.get("transform")), dtype=np.float64)
             except Exception as error:
                 raise InvalidFloorPlanError(f"{where}: transform {shorten(element.get('transform'))}") from error
         own = {element.get(key) for key in (_LABEL, "id")} | set(element.get("class", "").split())
@@ -129,6 +143,8 @@ def _shapes(root: ElementTree.Element) -> Iterator[_Shape]:
         elif tag in _POINTS and style.get("visibility") not in ("hidden", "collapse"):
             colours = {_colour(style[key]) for key in ("stroke", "fill") if style.get(key, "none") != "none"}
             yield element, matrix, tags | colours, where
+        elif tag not in _POINTS and element.tag.startswith((_SVG, tag)):
+            others[tag] += 1
 
     return walk(root, np.eye(3), frozenset(), {}, 0)
 

@@ -1,15 +1,20 @@
 """Which walls of a map the beams contradict: what moved, doors that opened, lines through scattered returns.
 
 A line map only gains walls: what one scan saw stays. Afterwards every beam is held against every wall that it met.
-A beam that ended on the wall, within 5 cm + 3 sigma, speaks for the wall there; one that went on speaks against it.
+A beam that ended on the wall, within 5 cm + 3 sigma, speaks for the wall there; one that went on and met something
+behind it speaks against it. A beam that met nothing speaks against a wall only from nearer than where others did see
+that wall: a laser misses dark, bright and oblique surfaces from afar. A beam of which nothing is known says nothing.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+
+from polyexplore_gym.mapping.extract import LEAST_RANGE
 
 STEP = 0.05
 """Beams are counted on pieces of about this length, m."""
@@ -21,6 +26,10 @@ LEAST_GAP = 0.2
 """Shortest part that is cut out of a wall, or left of it where something is cut out, m."""
 CLEARANCE = 0.05
 """What lies within this + 3 sigma of a wall lies on it, m."""
+BIN = 0.5
+"""Beams that met nothing are counted by their distance to the wall, in steps of this, m."""
+BINS = 64
+"""So many steps; farther off, such a beam says nothing."""
 OBLIQUE = math.cos(math.radians(80.0))
 """A more oblique beam says nothing."""
 
@@ -31,10 +40,36 @@ def pieces_of(segments: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(np.maximum(np.ceil(length / STEP), 1))]).astype(np.int64)
 
 
+class Counts(NamedTuple):
+    """Beams on each of P pieces."""
+
+    stopped: np.ndarray
+    """(P,) that ended there."""
+    passed: np.ndarray
+    """(P,) that passed through it and ended behind it."""
+    blank: np.ndarray
+    """(P, BINS) that met nothing, by distance."""
+    seen_from: np.ndarray
+    """(P,) farthest place from which a beam ended there, m."""
+
+    @classmethod
+    def zero(cls, pieces: int) -> Counts:
+        """No beam on any of so many pieces."""
+        whole = np.zeros(pieces, np.int64), np.zeros(pieces, np.int64)
+        return cls(*whole, np.zeros((pieces, BINS), np.int32), np.zeros(pieces))
+
+    @property
+    def through(self) -> np.ndarray:
+        """(P,) beams that speak against each piece."""
+        near = np.arange(BINS) < np.floor(self.seen_from / BIN)[:, None]
+        return self.passed + (self.blank * near).sum(axis=1)
+
+
 @njit(cache=True)
 def count(
     segments: np.ndarray,
     begin: np.ndarray,
+    walls: np.ndarray,
     angles: np.ndarray,
     ranges: np.ndarray,
     max_range: float,
@@ -42,23 +77,23 @@ def count(
     covariance: np.ndarray,
     var_range: float,
     var_angle: float,
-    stopped: np.ndarray,
-    passed: np.ndarray,
-) -> None:
-    """Add one scan's beams to the counts of those that ended on each piece, and that passed through it.
+    counts: Counts,
+) -> tuple[int, int]:
+    """Add one scan's beams to the counts of each piece; returns how many ended on walls, and passed through them.
 
     Args:
         segments: (R, 4) walls in the map frame, m.
-        begin: of `pieces_of`; `stopped` and `passed` (begin[-1],) are the counts.
+        begin: of `pieces_of`; the counts are of begin[-1] pieces.
+        walls: (R,) which segments are walls: the beams on them are told of.
         angles: (b,) beam angles in the laser's frame, rad, increasing.
-        ranges: (b,) m; max_range or more is no return: free as far as that.
+        ranges: (b,) m; max_range or more is no return. NaN and less than 1e-6: nothing is known.
         pose, covariance: (3,) and (3, 3) of the laser.
         var_range, var_angle: of the noise, m2, rad2.
     """
     var_xy = 0.5 * (covariance[0, 0] + covariance[1, 1])
     var_turn = var_angle + covariance[2, 2]
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    n = angles.size
+    n, stopped, passed = angles.size, 0, 0
     for i in range(segments.shape[0]):
         dx, dy = segments[i, 0] - pose[0], segments[i, 1] - pose[1]
         ax, ay = c * dx + s * dy, c * dy - s * dx
@@ -93,17 +128,27 @@ def count(
                 at = rho / across
                 along = (at * ct - ax) * ux + (at * st - ay) * uy
                 sigma = math.sqrt(var_range * across * across + var_xy + var_turn * at * at * (1.0 - across * across))
-                beyond = min(ranges[k], max_range) * across - rho
                 tolerance = CLEARANCE + 3.0 * sigma
                 q = first + min(max(int(along / length * pieces), 0), pieces - 1)
+                if not ranges[k] >= LEAST_RANGE:
+                    continue
+                if ranges[k] >= max_range:
+                    if max_range * across - rho > tolerance and at < BIN * BINS:
+                        counts.blank[q, int(at / BIN)] += 1
+                    continue
+                beyond = ranges[k] * across - rho
                 if beyond > tolerance:
-                    passed[q] += 1
-                elif beyond > -tolerance and ranges[k] < max_range:
-                    stopped[q] += 1
+                    counts.passed[q] += 1
+                    passed += walls[i]
+                elif beyond > -tolerance:
+                    counts.stopped[q] += 1
+                    stopped += walls[i]
+                    counts.seen_from[q] = max(counts.seen_from[q], at)
+    return stopped, passed
 
 
 def confirmed(
-    segments: np.ndarray, begin: np.ndarray, stopped: np.ndarray, passed: np.ndarray, ratio: float
+    segments: np.ndarray, begin: np.ndarray, stopped: np.ndarray, against: np.ndarray, ratio: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The parts of the segments (R, 4) that are not contradicted: parts (K, 4) and the segment of each (K,).
 
@@ -111,7 +156,7 @@ def confirmed(
     """
     parts, of = [], []
     for i, segment in enumerate(segments):
-        stop, through = stopped[begin[i] : begin[i + 1]], passed[begin[i] : begin[i + 1]]
+        stop, through = stopped[begin[i] : begin[i + 1]], against[begin[i] : begin[i + 1]]
         bad = (_around(through) >= LEAST_BEAMS) & (_around(through) > ratio * _around(stop))
         bad |= (_around(bad) > 0) & (through > ratio * stop)  # as far as the edges of the opening
         least = min(math.ceil(LEAST_GAP / STEP), bad.size)

@@ -195,6 +195,7 @@ def test_simplification_obeys_the_tolerance(tmp_path):
         ({"origin": [0, 0, 0, 0]}, "origin .* expected"),
         ({"origin": "here"}, "origin 'here': expected"),
         ({"origin": [0, float("inf"), 0]}, "origin inf: expected a finite number"),
+        ({"origin": [0, 0, 90]}, r"origin \[0, 0, 90\]: the yaw is in radians"),
         ({"negate": 2}, "negate 2: must be 0 or 1"),
         ({"occupied_thresh": 1.5}, "occupied_thresh .* must lie in 0 to 1"),
         ({"occupied_thresh": 0.1}, "free_thresh .* must not exceed"),
