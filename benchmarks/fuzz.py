@@ -321,7 +321,6 @@ def case_of(number: int) -> Case:
         "robot": {"radius": radius, "track": 1.324 * radius, "max_speed": 1.2 * size, "max_acceleration": 0.6 * size},
         "drive": {"mode": str(rng.choice(["kinematic", "kinematic", "physics"]))},
         "pose": {"mode": str(rng.choice(["exact"] * 7 + ["gaussian", "odometry", "slam"]))},
-        "mapping": {} if with_robot else {"min_length": 0.25, "door_width": 0.5},
         "exploration": {
             "placement": str(rng.choice(["in_front", "midpoint"])),
             "front_distance": None if with_robot else 1.0,
