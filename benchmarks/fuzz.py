@@ -1,6 +1,6 @@
 """Where does the environment crash, hang or end too early? Random configurations and plans, each from one integer.
 
-    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--out results/fuzz]
+    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--largest 10000] [--out results/fuzz]
     python benchmarks/fuzz.py --case 17 [--picture x.png]
     python benchmarks/fuzz.py --scaled [--first 0] [--count 50]
 
@@ -596,6 +596,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--cases", type=int, nargs="+", help="these instead, also those played already")
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after so many")
+    parser.add_argument("--largest", type=float, default=math.inf, help="leave out plans of more squares of the radius")
     parser.add_argument("--case", type=int, help="play this one here and print all about it")
     parser.add_argument("--picture", type=Path, help="of --case")
     parser.add_argument("--scaled", action="store_true", help="the same exploration in another size")
@@ -629,6 +630,8 @@ def _study(options: argparse.Namespace) -> None:
         for number in todo:
             if time.monotonic() - began > options.seconds:
                 break
+            if options.largest < math.inf and case_of(number).size > options.largest:
+                continue
             result = known[number] = child.play(number)
             out.write(json.dumps(result) + "\n")
             out.flush()
