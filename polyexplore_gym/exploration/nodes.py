@@ -158,9 +158,7 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
         else:
             # Only from the known side is the edge a window into the unknown.
             ahead = (mx - vx) * nx + (my - vy) * ny
-            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(
-                vx, vy, tx, ty, walls, pieces, chain, chain, tol
-            )
+            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(vx, vy, tx, ty, walls, pieces, chain, chain, tol)
         if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, scans, tol):
             best = d
             bx = vx

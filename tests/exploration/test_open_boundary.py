@@ -92,9 +92,7 @@ def places(rng: np.random.Generator, floor: Any, walls: np.ndarray, count: int) 
             p = rng.uniform((x0, y0), (x1, y1))
         if not shapely.contains_xy(free, *p):
             continue
-        if found and not any(
-            shapely.LineString([p, q[:2]]).within(floor) and math.dist(p, q[:2]) < 6.0 for q in found
-        ):
+        if found and not any(shapely.LineString([p, q[:2]]).within(floor) and math.dist(p, q[:2]) < 6.0 for q in found):
             continue
         found.append(np.array([*p, rng.uniform(-math.pi, math.pi)]))
     return np.array(found)
