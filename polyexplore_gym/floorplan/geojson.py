@@ -102,7 +102,7 @@ def read(data: Mapping[str, Any], *, units: object = None, wall_thickness: float
         raise InvalidFloorPlanError(f"meta: expected an object, got {type(meta).__name__}")
     name = properties.get("name")
     return Floor(
-        polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None, offset=taken
+        polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None, offset=shift
     )
 
 
