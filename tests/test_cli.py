@@ -235,12 +235,14 @@ def test_a_plan_is_read_and_written(tmp_path, capsys):
     assert "strict: nothing may be left out" in capsys.readouterr().err
     assert main(["plan", str(tmp_path / "b.json"), "--out", str(tmp_path / "b.bmp")]) == 2
     assert "the name must end in" in capsys.readouterr().err
-    assert main(["plan", str(tmp_path / "b.json"), "--snap", "nan"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main(["plan", str(tmp_path / "b.json"), "--snap", "nan"])
+    assert "snap = nan: must be a finite number of metres" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_robot_of_the_configuration_decides_what_is_kept(tmp_path, capsys):
     ring = [[0, 0], [6, 0], [6, 2], [6.2, 2], [6.2, 0], [9, 0], [9, 4], [6.2, 4], [6.2, 2.5], [6, 2.5], [6, 4], [0, 4]]
-    save_plan(FloorPlan.create(ring), tmp_path / "a.json")
+    save_plan(FloorPlan.create(ring, name="a"), tmp_path / "a.json")
     (tmp_path / "big.json").write_text(json.dumps({"robot": {"radius": 0.3}, "drive": {"mode": "kinematic"}}))
     run = ["run", str(tmp_path / "a.json"), "--config", str(tmp_path / "big.json")]
     assert main(run) == 0
