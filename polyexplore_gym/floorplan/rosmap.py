@@ -212,12 +212,11 @@ def _free(
         is_free &= opaque
         is_occupied &= opaque
     if fields["mode"] != "raw":
-        # A jpg smears its greys.
-        unknown = np.abs(levels - robot_map.UNKNOWN) <= (
-            3 if fields["image"].lower().endswith((".jpg", ".jpeg")) else 0
-        )
+        # A jpg smears its greys, and other maxvals than 255 round them.
+        smeared = 3 if fields["image"].lower().endswith((".jpg", ".jpeg")) else int(brightness.dtype != np.uint8)
+        unknown = np.abs(levels - robot_map.UNKNOWN) <= smeared
         counts = _histogram(grey)
-        would_be_free = bool(free[robot_map.UNKNOWN] and counts[unknown].any())
+        would_be_free = bool((free & unknown & (counts > 0)).any())
         if would_be_free and (fields["mode"] == "trinary" or _is_plain(counts)):
             is_free &= cv2.LUT(grey, unknown.astype(np.uint8)) == 0
             warnings.warn(
