@@ -7,20 +7,23 @@ from collections.abc import Mapping
 
 import numpy as np
 
+NOTHING = 0
+"""What a policy answers where no node can be chosen, as on a plan seen whole from the start: any action ends that."""
+
 
 def best(score: np.ndarray, observation: Mapping[str, np.ndarray]) -> int:
-    """Index of the highest score among the nodes that can be chosen; ties go to the lower index.
+    """Index of the highest score among the nodes that can be chosen; ties go to the lower index. None: `NOTHING`.
 
     Args:
         score: (max_nodes,) one a slot; those of masked slots are not looked at.
         observation: its `action_mask` (max_nodes,) says which slots can be chosen.
 
     Raises:
-        ValueError: no node can be chosen, or a reachable node's score is not a number.
+        ValueError: a reachable node's score is not a number.
     """
     reachable = np.flatnonzero(observation["action_mask"])
     if len(reachable) == 0:
-        raise ValueError("no node can be chosen: the episode is over")
+        return NOTHING
     scores = np.asarray(score, dtype=np.float64)[reachable]
     if np.isnan(scores).any():
         raise ValueError("the score of a reachable node is not a number")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from baselines.choice import best, number
+from baselines.choice import NOTHING, best, number
 from baselines.pockets import pockets
 from baselines.tours import ways
 
@@ -35,6 +35,8 @@ class Rollout:
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The node with the shortest mean of the ways played out; needs `observation.pairwise`."""
         slots, cost, between = ways(observation)
+        if not len(slots):
+            return NOTHING
         radius, _ = pockets(observation, slots)
         shape = (self.samples, len(slots), _DEEPEST)
         further = self.scale * radius[:, None] * rng.exponential(size=shape)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from baselines.choice import best, number
+from baselines.choice import NOTHING, best, number
 from baselines.tours import tours, ways
 
 
@@ -26,6 +26,8 @@ class Tour:
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The first node of the shortest tour; needs `observation.pairwise`."""
         slots, cost, between = ways(observation)
+        if not len(slots):
+            return NOTHING
         score = np.zeros(len(observation["action_mask"]))
         score[slots] = -tours(cost, between)[0] - self.near * cost
         return best(score, observation)

@@ -205,10 +205,8 @@ def ways(observation: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray,
         InvalidConfigError: the observation lacks the path lengths between nodes.
     """
     slots = np.flatnonzero(observation["action_mask"])
-    if len(slots) == 0:
-        raise ValueError("no node can be chosen: the episode is over")
     between = np.asarray(observation["path_lengths"], dtype=np.float64)[np.ix_(slots, slots)]
     position = np.asarray(observation["node_position"], dtype=np.float64)[slots]
-    if not between.any() and np.ptp(position, axis=0).any():
+    if len(slots) and not between.any() and np.ptp(position, axis=0).any():
         raise InvalidConfigError("tours need the path lengths between nodes: observation.pairwise = True")
     return slots, np.asarray(observation["node_path_length"], dtype=np.float64)[slots], between

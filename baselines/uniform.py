@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from baselines.choice import NOTHING
+
 
 class Uniform:
     """The policy `random`."""
@@ -17,5 +19,5 @@ class Uniform:
         """A reachable node drawn from `rng`."""
         reachable = np.flatnonzero(observation["action_mask"])
         if len(reachable) == 0:
-            raise ValueError("no node can be chosen: the episode is over")
+            return NOTHING
         return int(reachable[rng.integers(len(reachable))])

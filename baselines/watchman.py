@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from baselines.choice import best, number
+from baselines.choice import NOTHING, best, number
 from baselines.pockets import pockets
 from baselines.tours import group_tours, ways
 
@@ -31,6 +31,8 @@ class Watchman:
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
         """The first node of the shortest tour; needs `observation.pairwise`."""
         slots, cost, between = ways(observation)
+        if not len(slots):
+            return NOTHING
         _, shared = pockets(observation, slots)
         joined = scipy.sparse.csr_array(np.minimum(shared, shared.T) >= self.shared)
         group = connected_components(joined, directed=False)[1].astype(np.int64)

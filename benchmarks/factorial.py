@@ -39,7 +39,7 @@ from polyexplore_gym.cli import BENCH_PLANS
 from polyexplore_gym.config import DriveConfig, EnvConfig, PoseConfig, SensorConfig
 from polyexplore_gym.evaluation import EpisodeRecord, Study, evaluate, name_policies
 from polyexplore_gym.evaluation.statistics import Interval, bootstrap_interval, geometric_mean
-from polyexplore_gym.evaluation.summary import completed
+from polyexplore_gym.evaluation.summary import finished
 from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.floorplan import FloorPlan, load_plan, suite
 
@@ -156,7 +156,7 @@ def comparable(runs: Sequence[Run]) -> list[Run]:
         by_condition[run.condition].append(run)
     kept: list[Run] = []
     for some in by_condition.values():
-        keys = {record.key for record in completed([run.record for run in some])}
+        keys = {record.key for record in finished([run.record for run in some])}
         kept += [run for run in some if run.record.key in keys]
     return kept
 

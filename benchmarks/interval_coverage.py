@@ -33,7 +33,7 @@ from polyexplore_gym.evaluation.statistics import (
     probability_of_improvement,
     proportion_interval,
 )
-from polyexplore_gym.evaluation.summary import completed
+from polyexplore_gym.evaluation.summary import finished
 
 POPULATION = 200_000
 """Runs from which the truth is taken where no formula gives it."""
@@ -124,7 +124,7 @@ class Resampled:
     """Experiments of buildings drawn from a folder of results, with replacement within each kind."""
 
     def __init__(self, folder: Path) -> None:
-        done = completed(read_records(folder))
+        done = finished(read_records(folder))
         policies = list(dict.fromkeys(r.policy for r in done))
         theirs_name = "nearest" if "nearest" in policies else policies[0]
         ours_name = next(p for p in policies if p != theirs_name)

@@ -6,7 +6,7 @@
 Nodes in front of the jump edges, kinematic drive. One row a planner and set of plans: the suites for tests as
 `polyexplore bench` takes them, and the shared plans where there are any. Distance over that of `nearest` on the same
 start (geometric mean and ratio of the means) and probability of the shorter way, with 95 % intervals over buildings,
-over the starts that all planners completed; milliseconds a decision, mean and longest. With `--models`, selectors
+over the starts that all planners finished; milliseconds a decision, mean and longest. With `--models`, selectors
 trained with different seeds, the last table says what the seed changes: mean over the models, Student's 95 % interval.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
@@ -52,7 +52,7 @@ def rows(name: str, records: list[EpisodeRecord], rng: np.random.Generator) -> t
     cells, ratios = [], {}
     for c in compare(records, rng):
         own = [r for r in records if r.policy == c.ours[0]]
-        both = {r.key[2:] for r in own if r.complete} & {r.key[2:] for r in records if r.policy == "nearest"}
+        both = {r.key[2:] for r in own if r.ended} & {r.key[2:] for r in records if r.policy == "nearest"}
         means = [
             statistics.fmean(r.distance for r in records if r.policy == policy and r.key[2:] in both)
             for policy in (c.ours[0], "nearest")

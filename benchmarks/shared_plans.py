@@ -5,9 +5,8 @@
 
 One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
 coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
-where it stood to measure and anywhere on the way (below 0: overlap; the engine lets a bump go some millimetres deep
-for one time step), and bumps a decision. `--noise` scales the laser's noise of range and angle. A run that was
-stopped goes on where it was with the same arguments.
+where it stood to measure and anywhere on the way (below 0: overlap), and bumps a decision. `--noise` scales the laser's
+noise of range and angle. A run that was stopped goes on where it was with the same arguments.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout.
@@ -110,8 +109,9 @@ def read_clearances(folder: Path) -> dict[Key, tuple[float, float]]:
 def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, float]]) -> list[str]:
     """The figures of one policy and placement."""
     played = [r for r in records if r.status != "failed"]
-    ended = sum(r.status == "complete" for r in records)
-    cells = [records[0].policy, records[0].placement, f"{ended}/{len(records)}", f"{len(records) - len(played)}",
+    ended = [r for r in records if r.ended]
+    cells = [records[0].policy, records[0].placement, f"{len(ended)}/{len(records)}",
+             f"{sum(not r.complete for r in ended)}", f"{len(records) - len(played)}",
              f"{sum(r.status == 'truncated' for r in records)}"]  # fmt: skip
     if not played:
         return [*cells, "-", "-", "-", "-", "-"]
@@ -160,9 +160,9 @@ def main() -> None:
             folder = out / f"{policy.replace(':', '_')}-{placement}"
             records = evaluate(study, out=folder, workers=options.workers, make_env=MakeWatched(folder))
             rows.append(row(records, read_clearances(folder)))
-            failed += [r for r in records if r.status != "complete"]
+            failed += [r for r in records if not r.complete]
     print(f"\n{len(plans)} plans x {options.seeds} starts, {options.drive}, {options.noise:g} x the laser's noise:\n")
-    header = ("policy", "placement", "ended by itself", "exceptions", "truncated", "seen, median %",
+    header = ("policy", "placement", "ended by itself", "with edges left", "exceptions", "truncated", "seen, median %",
               "seen, least % (plan)", "clearance standing, least mm", "on the way, least mm (plan)",
               "bumps a decision")  # fmt: skip
     print(format_table(header, rows, "markdown"))

@@ -119,7 +119,7 @@ def play(mode: str, plan: FloorPlan, seed: int, limit: int | None = None) -> Pla
             played.decisions += 1
             over = terminated or truncated
         played.wall, played.cpu = time.perf_counter() - wall, time.process_time() - cpu
-    played.info, played.complete = info, not info["action_mask"].any()
+    played.info, played.complete = info, info["outcome"]["status"] == "complete"
     return played
 
 

@@ -6,18 +6,17 @@ for films, `[window]` for the window.
 
 from __future__ import annotations
 
-import importlib
 import os
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from polyexplore_gym.errors import MissingDependencyError, RenderingError
+from polyexplore_gym.errors import RenderingError
+from polyexplore_gym.optional import require
 
 if TYPE_CHECKING:
     from polyexplore_gym.snapshot import Snapshot
@@ -119,17 +118,6 @@ class Window:
             require("pygame", "window").display.quit()
             self._screen = None
         self.closed = True
-
-
-def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module; raises `MissingDependencyError` with the extra that brings it."""
-    if module == "pygame":
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        hint = f'pip install "polyexplore-gym[{extra}]"'
-        raise MissingDependencyError(f"this needs {module}, which is not installed: {hint}") from error
 
 
 def _checked(frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

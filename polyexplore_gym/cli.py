@@ -11,14 +11,15 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.config import EnvConfig, PlanFileConfig, from_mapping, to_mapping
 from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+from polyexplore_gym.presets import PresetName
 
 if TYPE_CHECKING:
     from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
@@ -39,8 +40,8 @@ LOOK_AHEAD = ("tour", "watchman", "rollout")
 SHOWN = 10
 """So many broken parts of a log are named, the rest is counted."""
 
-PLAN_SUFFIXES = (".json", ".geojson", ".yaml", ".yml")
-"""What is taken for a plan in a folder."""
+FOLDER_SUFFIXES = (".json", ".geojson", ".yaml", ".yml", ".dxf")
+"""What is taken for a plan in a folder; .svg is not, since pictures are."""
 
 Placement = Literal["midpoint", "in_front"]
 Drive = Literal["physics", "kinematic"]
@@ -75,6 +76,8 @@ class Bench:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration, as in {"sensor": {"max_range": 30}}."""
     reference: str = "nearest"
@@ -83,6 +86,7 @@ class Bench:
     """Folder of references that know the plans (those missing are computed, a minute each): adds ratios to them."""
     plots: bool = True
     """Draw the plots."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +105,8 @@ class Run:
     """Where nodes are placed, instead of what the configuration says."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     gif: Path | None = None
@@ -115,6 +121,24 @@ class Run:
     """Film: a frame every so many metres as well; 0: decisions only."""
     fps: float = 10.0
     """Film: frames a second."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Read a floor plan file, say what a robot can reach of it, and write it in other formats."""
+
+    plan: tyro.conf.Positional[str]
+    """A plan file, or a plan of a suite: home-test/3."""
+    out: tuple[Path, ...] = ()
+    """Files to write: .json, .geojson, .dxf, .svg, or .yaml for a map of ROS map_server with its .pgm."""
+    radius: float = 0.25
+    """Radius of the robot, m; 0: everything that is connected."""
+    start: tuple[float, float] | None = None
+    """A point x, y in the part that is meant, m; the largest part if left out."""
+    resolution: float = 0.05
+    """Side of a pixel of the maps written, m."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,6 +197,8 @@ class Eval:
     """Folder of the results."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
     config: Path | None = None
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
@@ -191,7 +217,8 @@ class Linemap:
     log: tyro.conf.Positional[Path]
     """The log."""
     out: tuple[Path, ...] = (Path("results/linemap"),)
-    """Files to write, .json, .geojson, .svg or .png, or folders, which get one of each, named after the log."""
+    """Files to write, .json, .geojson, .svg, .png or .yaml (for ROS map_server, with a .pgm), or folders, which get
+    one of each, named after the log."""
     max_range: float | None = None
     """Range from which on a beam has no return, m (default: what the log says, else 30)."""
     sigma_range: float = 0.01
@@ -263,7 +290,7 @@ def evaluate_model(options: Eval) -> int:
             "--against: names of policies, of which none is 'learned': so the model is called here"
         )
     policies["learned"] = make_policy("learned", model=options.model)
-    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "config", "plots")
+    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "preset", "config", "plots")
     fields = {name: getattr(options, name) for name in same}
     return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
 
@@ -277,7 +304,7 @@ def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
 
     if options.seeds < 1:
         raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
-    config = _config(options.config, options.drive)
+    config = _config(options.config, options.preset, options.drive)
     study = Study(
         policies=policies,
         plans=list(_bench_plans(options, config)),
@@ -334,8 +361,8 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation.runner import make_env
 
     _check_run(options)
-    config = _config(options.config, options.drive, options.placement)
-    plan = _plan(options.plan)
+    config = _config(options.config, options.preset, options.drive, options.placement)
+    plan = _plan(options.plan, config.robot.radius, options.start, options.reading)
     policy = load_policy(options.policy)
     env = make_env(config)
     start = {}
@@ -361,6 +388,28 @@ def run(options: Run) -> int:
         _film(moments, films, options)
     env.close()
     return 0 if record.status != "failed" else 1
+
+
+def plan(options: Plan) -> int:
+    """Read a plan and write it."""
+    from polyexplore_gym.floorplan import PLAN_SUFFIXES, save_plan
+
+    for path in options.out:
+        if path.suffix.lower() not in PLAN_SUFFIXES:
+            raise InvalidConfigError(f"{path}: the name must end in {', '.join(PLAN_SUFFIXES)}")
+        if not path.parent.is_dir():
+            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+    found = _plan(options.plan, options.radius, options.start, options.reading)
+    x0, y0, x1, y1 = found.bounds
+    print(f"{found.name}: {found.area:.1f} m2, {x1 - x0:.2f} x {y1 - y0:.2f} m, {found.n_vertices} vertices, "
+          f"{len(found.holes)} holes")  # fmt: skip
+    for path in options.out:
+        try:
+            save_plan(found, path, resolution=options.resolution)
+        except OSError as error:
+            raise InvalidConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+        print(f"written: {path}")
+    return 0
 
 
 def linemap(options: Linemap) -> int:
@@ -433,6 +482,7 @@ _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "train": (Train, train),
     "eval": (Eval, evaluate_model),
     "report": (Report, report),
+    "plan": (Plan, plan),
     "linemap": (Linemap, linemap),
 }
 
@@ -457,14 +507,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
 
 
-def _config(path: Path | None, drive: str | None, placement: str | None = None) -> EnvConfig:
-    config = EnvConfig()
+def _config(path: Path | None, preset: str | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+    values: Any = {}
     if path is not None:
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise InvalidConfigError(f"{path}: cannot be read: {error}") from error
-        config = from_mapping(EnvConfig, values, path=str(path))
+    if preset is not None and isinstance(values, dict):
+        values = {**values, "preset": preset}
+    config = from_mapping(EnvConfig, values, path=str(path or "config"))
     if drive is not None:
         config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
     if placement is not None:
@@ -472,7 +524,7 @@ def _config(path: Path | None, drive: str | None, placement: str | None = None) 
     return config
 
 
-def _plan(name: str) -> FloorPlan:
+def _plan(name: str, radius: float, start: Sequence[float] | None, reading: PlanFileConfig) -> FloorPlan:
     """A plan by path, or by suite and number; what exists as a file is a path."""
     from polyexplore_gym.floorplan import load_plan
 
@@ -482,7 +534,7 @@ def _plan(name: str) -> FloorPlan:
         if int(number) >= len(suite):
             raise InvalidFloorPlanError(f"{name}: {suite_name} has the plans 0 to {len(suite) - 1}")
         return suite.plan(int(number))
-    return load_plan(name)
+    return load_plan(name, radius=radius, start=start, **to_mapping(reading))
 
 
 def _suite(name: str) -> Any:
@@ -514,7 +566,7 @@ def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
         if len(known) == first:
             break
         try:
-            plan = load_plan(path)
+            plan = load_plan(path, radius=config.robot.radius, **to_mapping(options.reading))
             plan.check_connected(config.robot.radius)
         except InvalidFloorPlanError as error:
             text = str(error)
@@ -532,7 +584,7 @@ def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
 def _plan_files(paths: Iterable[Path]) -> Iterator[Path]:
     for path in paths:
         if path.is_dir():
-            yield from sorted(p for p in path.iterdir() if p.suffix.lower() in PLAN_SUFFIXES and p.is_file())
+            yield from sorted(p for p in path.iterdir() if p.suffix.lower() in FOLDER_SUFFIXES and p.is_file())
         else:
             yield path
 
@@ -571,7 +623,7 @@ def _check_run(options: Run) -> None:
     if not 0.1 <= options.fps <= 100:
         raise InvalidConfigError(f"--fps {options.fps}: must lie in 0.1 to 100")
     if any((options.gif, options.mp4, options.png)):
-        from polyexplore_gym.animation import require
+        from polyexplore_gym.optional import require
 
         for module in ("matplotlib", *(["PIL"] if options.gif else []), *(["imageio_ffmpeg"] if options.mp4 else [])):
             require(module, "plots")
@@ -602,7 +654,12 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
         f"{percent} % after " + (f"{d:.1f} m" if d is not None else "- (never)")
         for percent, d in ((90, record.distance_90), (95, record.distance_95), (99, record.distance_99))
     ]
-    status = record.status if record.error is None else f"failed: {record.error}"
+    left = (
+        ("out of reach", record.unreached, record.unreached_length),
+        ("given up", record.given_up, record.given_up_length),
+    )
+    told = [f"{n} jump edges ({length:.1f} m) {what}" for what, n, length in left if n]
+    status = ", ".join([record.status if record.error is None else f"failed: {record.error}", *told])
     return (
         f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
         f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"
@@ -619,8 +676,8 @@ def _stem(log: Path) -> str:
 
 def _map_files(options: Linemap) -> list[Path]:
     """The files to write; rejects what cannot be written before the work and not after it."""
-    from polyexplore_gym.animation import require
     from polyexplore_gym.mapping import MAP_SUFFIXES
+    from polyexplore_gym.optional import require
 
     if not 100 <= options.width <= 20_000:
         raise InvalidConfigError(f"--width {options.width}: must lie in 100 to 20000")

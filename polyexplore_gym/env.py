@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,13 +14,13 @@ from gymnasium import spaces
 from polyexplore_gym import observation
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
-from polyexplore_gym.exploration import ExplorationMap
+from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
 from polyexplore_gym.floorplan import suite as suite_named
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
-from polyexplore_gym.sim.coverage import Coverage, grid_points
+from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
 from polyexplore_gym.sim.pose import PoseModel
 from polyexplore_gym.sim.world import World
 from polyexplore_gym.snapshot import Snapshot
@@ -29,8 +29,6 @@ WINDOW_FPS = 10.0
 """The window shows at most so many pictures a second."""
 WINDOW_STEP = 0.5
 """Way between two pictures of a drive in the window, m."""
-COVERAGE_GRID = 0.2
-"""Spacing of the sample points behind `info["coverage"]`, m."""
 
 
 class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
@@ -57,7 +55,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """The plan to explore, or the name of a suite from which each episode draws one.
 
         Args:
-            plan: a floor plan, or the path of one in any known format.
+            plan: a floor plan, or the path of one in any known format. Of a file that falls into parts for this robot
+                the largest is taken, or that with the start given to `reset`, with a warning; a `FloorPlan` that does
+                is refused.
             suite: such as "home-train"; see `polyexplore_gym.floorplan.list_suites()`.
             config: an `EnvConfig`, a nested mapping of its fields, or None for the defaults.
             render_mode: "rgb_array", "human" or None.
@@ -77,6 +77,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.render_mode = render_mode
         self._suite = None if suite is None else _suite(suite)
         self._plan = None if plan is None else self._checked(plan)
+        self._plan_file = None if isinstance(plan, FloorPlan) else plan
         self.observation_space = observation.space(self.config.observation)  # type: ignore[assignment]
         self.action_space = spaces.Discrete(self.config.observation.max_nodes)
         self._world: World | None = None
@@ -106,9 +107,11 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         c = self.config
         plan = self._plan
         if given is not None:
-            plan = self._checked(given)
+            plan = self._checked(given, start)
         elif self._suite is not None:
             plan = self._suite.plan(int(plan_rng.integers(len(self._suite))))
+        elif self._plan_file is not None and start is not None and plan is not None and not plan.covers(start):
+            plan = self._checked(self._plan_file, start)
         if plan is None:
             raise InvalidConfigError("no floor plan: give plan= to the environment or options={'plan': ...} to reset")
         if start is None:
@@ -119,8 +122,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.plan = plan
         self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
-        self._coverage = Coverage(grid_points(plan.segments, COVERAGE_GRID))
-        self._lines = LineMap(c.mapping, c.sensor)
+        self._coverage = Coverage(grid_points(plan.segments, grid_spacing(c.robot.radius, plan.area)))
+        self._mapping = c.mapping.resolved(c.robot.radius)
+        self._lines = LineMap(self._mapping, c.sensor)
         self._localizer = Localizer() if c.pose.mode == "slam" else None
         self._exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
         self._decisions = self._measurements = self._collisions = 0
@@ -133,7 +137,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._path = self._pose_model.estimate[None, :2]
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
         self._observe()
-        info = self._info(StepOutcome(), invalid=False)
+        info = self._info(StepOutcome(), invalid=False, truncated=False)
         if self.render_mode == "human":
             self.render()
         return self._observation(), info
@@ -167,9 +171,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             invalid_action=float(choice and not valid),
         )
         self._completed = terminated
-        info = self._info(outcome, invalid=not valid)
-        reward = float(sum(info["rewards"].values()))
         truncated = not terminated and self._decisions >= self.config.max_decisions
+        info = self._info(outcome, invalid=not valid, truncated=truncated)
+        reward = float(sum(info["rewards"].values()))
         if scene is not None:
             self._show_motion(scene, node if valid else None)
         return self._observation(), reward, terminated, truncated, info
@@ -284,7 +288,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         assert self._world is not None
         laser = self._world.laser
         ranges = laser.measure(self._world.segments, pose, self._laser_rng)
-        found = extract_lines(laser.angles, ranges, self.config.sensor, self.config.mapping)
+        found = extract_lines(laser.angles, ranges, self.config.sensor, self._mapping)
         estimate, covariance = self._pose_model.measured(pose)
         if self._localizer is None:
             return ranges, found, Correction.none(estimate, covariance)
@@ -329,7 +333,15 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """The observation, the caller's own to change."""
         return {key: value.copy() for key, value in self._observed.arrays.items()}
 
-    def _info(self, outcome: StepOutcome, *, invalid: bool) -> dict[str, Any]:
+    def _outcome(self, truncated: bool) -> dict[str, Any]:
+        """How the episode stands, and which jump edges (number and metres) it leaves."""
+        if not truncated and self._observed.arrays["action_mask"].any():
+            return {"status": "running", **Remains(0, 0.0, 0, 0.0)._asdict()}
+        left = self._exploration.remains()
+        status = "budget" if truncated else "unreached" if left.unreached or left.given_up else "complete"
+        return {"status": status, **left._asdict()}
+
+    def _info(self, outcome: StepOutcome, *, invalid: bool, truncated: bool) -> dict[str, Any]:
         return {
             "action_mask": self._observed.arrays["action_mask"].copy(),
             "distance": self._distance,
@@ -341,6 +353,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             "path": tuple(map(tuple, self._path.tolist())),
             "rewards": rewards(outcome, self.config.reward),
             "invalid_action": invalid,
+            "outcome": self._outcome(truncated),
             "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
         }
 
@@ -353,10 +366,12 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             raise InvalidActionError(f"action {action}: must lie in 0 to {self.action_space.n - 1}")  # type: ignore[attr-defined]
         return int(action)
 
-    def _checked(self, plan: FloorPlan | str | Path) -> FloorPlan:
+    def _checked(self, plan: FloorPlan | str | Path, start: Sequence[float] | None = None) -> FloorPlan:
+        """The plan, or of a file the part that the robot can reach (from the start); raises if it falls apart."""
         if not isinstance(plan, (FloorPlan, str, Path)):
             raise InvalidFloorPlanError(f"plan: expected a FloorPlan or a path, got {type(plan).__name__}")
-        plan = plan if isinstance(plan, FloorPlan) else load_plan(plan)
+        if not isinstance(plan, FloorPlan):
+            plan = load_plan(plan, radius=self.config.robot.radius, start=start)
         plan.check_connected(self.config.robot.radius)
         return plan
 

@@ -9,6 +9,10 @@ class InvalidFloorPlanError(PolyExploreError, ValueError):
     """A floor plan is unusable; the message names the ring, the vertex and the reason."""
 
 
+class FloorPlanWarning(UserWarning):
+    """A floor plan file was read, but not all of it was taken as it stands; the message says what and why."""
+
+
 class InvalidConfigError(PolyExploreError, ValueError):
     """A configuration field is unknown or out of range; the message names it."""
 

@@ -14,11 +14,11 @@ import numpy as np
 from gymnasium import spaces
 from numba import njit
 
-from polyexplore_gym.config import ObservationConfig
+from polyexplore_gym.config import LONGEST, ObservationConfig
 from polyexplore_gym.exploration import ExplorationMap
 from polyexplore_gym.mapping import LineMap
 
-LIMIT = 1e5
+LIMIT = LONGEST
 """Bound of every position and length, m; also the path length to what cannot be reached."""
 
 _VARIANCE = 1e6
@@ -79,15 +79,15 @@ def observe(
     """Observe the state of the maps from the estimated `pose` (3,) with `covariance` (3, 3)."""
     n, m = config.max_nodes, config.max_lines
     c = exploration.chains
-    rows = np.arange(len(c))
-    if len(c) > n:
+    rows = np.arange(c.size)
+    if c.size > n:
         rows = np.sort(np.lexsort((rows, c.path_length))[:n])
     k = len(rows)
     frame = pose if config.relative else np.zeros(3)
     arrays: dict[str, np.ndarray] = {key: np.zeros(shape, dtype) for key, shape, dtype in _layout(n, m)}
     arrays["pose"][:] = pose
     arrays["pose_covariance"][:] = np.clip(covariance, -_VARIANCE, _VARIANCE)
-    arrays["max_range"][:] = min(max_range, LIMIT)
+    arrays["max_range"][:] = max_range
     arrays["node_mask"][:k] = 1
     _nodes(
         rows, c.ends, c.node, c.path_length, c.length, c.gain, c.kind, c.visits, frame, arrays["edges"],
@@ -103,7 +103,7 @@ def observe(
         which = np.flatnonzero(lines.alive)[which]
     arrays["line_mask"][: len(which)] = 1
     _lines(which, lines.segments, lines.line, lines.alpha, lines.rho, lines.covariance, frame, arrays["lines"])
-    return Observed(arrays, rows, len(c) - k, cut_lines)
+    return Observed(arrays, rows, c.size - k, cut_lines)
 
 
 @functools.cache
@@ -159,7 +159,7 @@ def _lines(which, segments, line, alpha, rho, covariance, frame, out):
         of = line[r]
         if of < 0:
             continue
-        # The line about the robot: DESIGN section 5 inverted, H = [[1, 0], [-dpsi, 1]].
+        # The line about the robot: `fit.to_map` inverted, H = [[1, 0], [-dpsi, 1]].
         ca = math.cos(alpha[of])
         sa = math.sin(alpha[of])
         shift = frame[0] * sa - frame[1] * ca

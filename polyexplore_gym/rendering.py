@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from polyexplore_gym.animation import Window, motion, require, save_animation
+from polyexplore_gym.animation import Window, motion, save_animation
 from polyexplore_gym.errors import RenderingError
+from polyexplore_gym.optional import require
 from polyexplore_gym.snapshot import Polygon, Snapshot
 
 if TYPE_CHECKING:

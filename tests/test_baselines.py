@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 from baselines import make_policy, policy_names
+from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidConfigError
-from polyexplore_gym.evaluation import Policy
+from polyexplore_gym.evaluation import Policy, run_episode
+from polyexplore_gym.floorplan import FloorPlan
 
 N = 6
 
@@ -59,9 +61,25 @@ def test_every_policy_chooses_a_reachable_node(name):
 
 
 @pytest.mark.parametrize("name", policy_names())
-def test_every_policy_says_when_nothing_is_left(name):
-    with pytest.raises(ValueError, match="episode is over"):
-        choose(name, observation(action_mask=[0] * N))
+def test_every_policy_has_an_answer_where_nothing_is_left(name):
+    action = choose(name, observation(action_mask=[0] * N))
+    assert (action, type(action)) == (0, int)
+
+
+@pytest.mark.parametrize("name", policy_names())
+def test_every_policy_explores_a_plan_that_is_seen_whole_from_the_start(name):
+    config = {"sensor": {"field_of_view": 2 * np.pi, "beams": 720}, "drive": {"mode": "kinematic"}}
+    env, policy, rng = PolyExploreEnv(config=config), make_policy(name), np.random.default_rng(0)
+    for side in (2.0, 3.0, 4.0):
+        room = FloorPlan.create([[0, 0], [side, 0], [side, side], [0, side]], name="room")
+        for seed in range(3):
+            seen, info = env.reset(seed=seed, options={"plan": room})
+            assert not info["action_mask"].any()
+            # The README's loop does not begin; one that asks for an action first gets it, and ends at no cost.
+            _, reward, terminated, truncated, info = env.step(policy.act(seen, info, rng))
+            assert (reward, terminated, truncated, info["distance"]) == (0.0, True, False, 0.0)
+            record = run_episode(env, policy, room, seed, label=name)
+            assert (record.ended, record.decisions, record.error) == (True, 0, None)
 
 
 @pytest.mark.parametrize("name", [n for n in policy_names() if n not in ("random", "learned", "rollout")])

@@ -68,7 +68,7 @@ def test_a_folder_is_compared(folder, tmp_path, capsys):
     assert "2 plans x 2 starts x 2 placements x 2 policies = 16 episodes" in captured.err
     records = read_records(out)
     assert len(records) == 16
-    assert {r.status for r in records} == {"complete"}
+    assert all(r.ended for r in records)
     assert {r.drive for r in records} == {"kinematic"}
     assert {r.plan for r in records} == {"rooms", "small"}
     assert {p["name"] for p in read_manifest(out)["study"]["plans"]} == {"rooms", "small"}
@@ -150,11 +150,36 @@ def test_a_configuration_file(folder, tmp_path, capsys):
     assert main(["bench", *arguments, "--config", str(config), "--workers", "1", "--out", str(out)]) == 0
     assert read_manifest(out)["study"]["config"]["sensor"]["beams"] == 181
     assert {(r.placement, r.drive) for r in read_records(out)} == {("in_front", "kinematic")}
+    out = tmp_path / "preset"
+    command = ["bench", *arguments, "--preset", "turtlebot4", "--config", str(config), "--workers", "1"]
+    assert main([*command, "--out", str(out)]) == 0
+    kept = read_manifest(out)["study"]["config"]
+    assert (kept["sensor"]["beams"], kept["sensor"]["max_range"], kept["robot"]["radius"]) == (181, 12.0, 0.17)
     config.write_text(json.dumps({"sensor": {"beems": 181}}))
     assert main(["bench", *arguments, "--config", str(config)]) == 2
     error = capsys.readouterr().err
     assert "beems" in error
     assert "config.json.sensor" in error
+
+
+def test_what_is_left_is_told(folder, capsys, monkeypatch):
+    from polyexplore_gym.env import PolyExploreEnv
+
+    left = {"status": "unreached", "unreached": 3, "unreached_length": 2.5, "given_up": 1, "given_up_length": 0.75}
+    monkeypatch.setattr(PolyExploreEnv, "_outcome", lambda self, truncated: left)
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    told = capsys.readouterr().out.splitlines()[0]
+    assert told.endswith("kinematic: unreached, 3 jump edges (2.5 m) out of reach, 1 jump edges (0.8 m) given up")
+
+
+def test_a_robot_by_name(folder, capsys):
+    assert main(["run", str(folder / "rooms.json"), "--preset", "turtlebot3", "--drive", "kinematic"]) == 0
+    slow = capsys.readouterr().out
+    assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
+    assert slow != capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["run", str(folder / "rooms.json"), "--preset", "r2d2"])
+    assert "turtlebot4" in capsys.readouterr().err
 
 
 def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):
@@ -181,6 +206,53 @@ def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):
         assert picture.size[0] == 240
 
 
+def test_a_plan_is_read_and_written(tmp_path, capsys):
+    drawn = [
+        [0, 0],
+        [600, 0],
+        [600, 200],
+        [620, 200],
+        [620, 0],
+        [900, 0],
+        [900, 400],
+        [620, 400],
+        [620, 250],
+        [600, 250],
+    ]
+    (tmp_path / "a.json").write_text(json.dumps({"exterior": [*drawn, [600, 400], [0, 400]]}))
+    out = [str(tmp_path / name) for name in ("b.json", "b.yaml", "b.geojson")]
+    assert main(["plan", str(tmp_path / "a.json"), "--units", "cm", "--radius", "0.2", "--out", *out]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "a: 35.3 m2, 9.00 x 4.00 m, 12 vertices, 0 holes" in captured.out
+    assert (tmp_path / "b.pgm").exists()
+    assert main(["plan", str(tmp_path / "b.yaml"), "--radius", "0.3", "--start", "8", "1"]) == 0
+    captured = capsys.readouterr()
+    assert "warning: " in captured.err
+    assert "reaches 32 % of the floor" in captured.err
+    assert captured.out.startswith("b: 11.")
+    assert main(["plan", str(tmp_path / "b.json"), "--radius", "0.3", "--strict"]) == 2
+    assert "strict: nothing may be left out" in capsys.readouterr().err
+    assert main(["plan", str(tmp_path / "b.json"), "--out", str(tmp_path / "b.bmp")]) == 2
+    assert "the name must end in" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["plan", str(tmp_path / "b.json"), "--snap", "nan"])
+    assert "snap = nan: must be a finite number of metres" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_robot_of_the_configuration_decides_what_is_kept(tmp_path, capsys):
+    ring = [[0, 0], [6, 0], [6, 2], [6.2, 2], [6.2, 0], [9, 0], [9, 4], [6.2, 4], [6.2, 2.5], [6, 2.5], [6, 4], [0, 4]]
+    save_plan(FloorPlan.create(ring, name="a"), tmp_path / "a.json")
+    (tmp_path / "big.json").write_text(json.dumps({"robot": {"radius": 0.3}, "drive": {"mode": "kinematic"}}))
+    run = ["run", str(tmp_path / "a.json"), "--config", str(tmp_path / "big.json")]
+    assert main(run) == 0
+    captured = capsys.readouterr()
+    assert "a (24 m2)" in captured.out
+    assert "reaches 68 % of the floor" in captured.err
+    assert main([*run, "--start", "8", "1", "0"]) == 0
+    assert "a (11 m2)" in capsys.readouterr().out
+
+
 def carmen(path: Path, *junk: str) -> Path:
     """A log of a laser that turns in the middle of a square room of 4 m, with broken lines at its end."""
     angles = np.radians(np.arange(-90, 91))
@@ -196,7 +268,8 @@ def test_a_log_becomes_a_map(tmp_path, capsys):
     log, out = carmen(tmp_path / "room.log", "FLASER 181 1.0 2.0", "1 2 3"), tmp_path / "maps"
     assert main(["linemap", str(log), "--out", str(out), str(tmp_path / "b.json")]) == 0
     captured = capsys.readouterr()
-    assert sorted(path.name for path in out.iterdir()) == ["room.geojson", "room.json", "room.png", "room.svg"]
+    suffixes = ("geojson", "json", "pgm", "png", "svg", "yaml")
+    assert sorted(path.name for path in out.iterdir()) == [f"room.{suffix}" for suffix in suffixes]
     assert (out / "room.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert "left out: line 9: 4 fields do not fit a FLASER message of 181 ranges" in captured.err
     assert "left out: line 10: not a CARMEN message" in captured.err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import runpy
@@ -14,9 +15,10 @@ from pathlib import Path
 import pytest
 
 from polyexplore_gym import __version__, cli
-from polyexplore_gym.config import EnvConfig, RewardConfig, to_mapping
+from polyexplore_gym.config import EnvConfig, RewardConfig, preset, to_mapping
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.floorplan import suite
+from polyexplore_gym.presets import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -40,7 +42,7 @@ def arguments(command: str) -> list[str]:
 
 def rows(head: str, text: str = README) -> list[list[str]]:
     """The cells of the table whose first column has this head."""
-    table = re.search(rf"^\| {re.escape(head)} \|.*\n\|[-| ]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)
+    table = re.search(rf"^\| {re.escape(head)} \|.*\n\|[-|: ]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)
     assert table is not None, head
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in table[1].splitlines()]
 
@@ -83,6 +85,18 @@ def test_the_first_loop_is_short_and_ends():
     assert len(loop) <= 12
     assert "action_mask" in PYTHON[0]
     assert "node_path_length" in PYTHON[0]
+
+
+def test_the_first_loop_works_on_a_plan_seen_whole_from_the_start(tmp_path, monkeypatch, capsys):
+    import gymnasium
+
+    from polyexplore_gym.floorplan import FloorPlan
+
+    room = FloorPlan.create([[0, 0], [3, 0], [3, 3], [0, 3]])
+    config = {"sensor": {"field_of_view": 2 * math.pi, "beams": 720}}
+    monkeypatch.setattr(gymnasium, "make", lambda *_, **__: PolyExploreEnv(room, config=config))
+    exec(compile(PYTHON[0], "README", "exec"), {})
+    assert capsys.readouterr().out == "0.0 m driven, 100.0 % seen\n"
 
 
 def test_there_is_something_to_test():
@@ -147,6 +161,15 @@ def test_the_tables_name_every_key():
     assert f"`max_decisions` ({EnvConfig().max_decisions})" in README
     assert set(names("criterion")) == set(cli.SCRIPTED)
     assert set(names("planner")) == set(cli.LOOK_AHEAD)
+
+
+def test_the_presets_are_listed():
+    told = {row[0].strip("| `"): [float(cell.strip(" |")) for cell in row[2:6]] for row in rows("preset")}
+    assert told.keys() == PRESETS.keys()
+    for name, figures in told.items():
+        c = preset(name)
+        known = [c.sensor.beams, math.degrees(c.sensor.field_of_view), c.sensor.max_range, c.robot.radius]
+        assert figures == pytest.approx(known), name
 
 
 def test_environments_are_listed():

@@ -33,7 +33,7 @@ SMALL = {**KINEMATIC, "observation": {"max_nodes": 16, "max_lines": 64}, "max_de
 REGISTERED = sorted(name for name in gym.registry if name.startswith("PolyExplore-"))
 INFO = {
     "action_mask", "distance", "coverage", "measurements", "sim_time", "collisions", "path", "rewards",
-    "invalid_action", "cut",
+    "invalid_action", "cut", "outcome",
 }  # fmt: skip
 REWARDS = {"distance", "coverage", "measurement", "collision", "completion", "invalid_action"}
 HOUSE = FloorPlan.create(
@@ -107,12 +107,23 @@ def play(
         assert not info["invalid_action"]
         assert terminated == (not info["action_mask"].any())
         assert truncated == (not terminated and decision >= env.config.max_decisions)
+        check_outcome(info["outcome"], terminated, truncated)
         for key in ("distance", "coverage", "measurements", "sim_time", "collisions"):
             assert info[key] >= before[key], key
         yield int(action), observation, reward, info, before
         if terminated or truncated:
             return
     return
+
+
+def check_outcome(outcome: dict[str, Any], terminated: bool, truncated: bool) -> None:
+    left = [outcome[name] for name in ("unreached", "unreached_length", "given_up", "given_up_length")]
+    assert [type(value) for value in left] == [int, float, int, float]
+    assert min(left) >= 0
+    if terminated:
+        assert outcome["status"] == ("unreached" if outcome["unreached"] or outcome["given_up"] else "complete")
+    else:
+        assert outcome["status"] == ("budget" if truncated else "running")
 
 
 # Conformance -------------------------------------------------------------------------------------
@@ -531,6 +542,7 @@ def test_a_plan_seen_from_the_start_ends_at_once():
     _, info = env.reset(seed=0)
     assert info["coverage"] == 1.0
     assert not info["action_mask"].any()
+    check_outcome(info["outcome"], terminated=True, truncated=False)
     _, reward, terminated, truncated, info = env.step(0)
     assert (reward, terminated, truncated) == (5.0, True, False)
     assert env.step(0)[1] == 0.0  # complete once

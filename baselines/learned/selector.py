@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import baselines.learned
+from baselines.choice import NOTHING
 
 baselines.learned.require("torch", "safetensors")
 
@@ -41,8 +42,9 @@ class Learned:
 
     def choose(self, observations: Sequence[Mapping[str, np.ndarray]]) -> list[int]:
         """The node chosen in each of several observations."""
-        seen = [features(o) for o in observations]
-        found = []
+        found = [NOTHING] * len(observations)
+        rows = [i for i, o in enumerate(observations) if np.any(o["action_mask"])]
+        seen = [features(observations[i]) for i in rows]
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # others would wait for each other longer than they work
         try:
@@ -50,7 +52,8 @@ class Learned:
                 for start in range(0, len(seen), 16):
                     some = seen[start : start + 16]
                     scores, _ = self.network(collate(some))
-                    found += [int(f.slots[row]) for f, row in zip(some, scores.argmax(dim=1).tolist(), strict=True)]
+                    for i, f, node in zip(rows[start:], some, scores.argmax(dim=1).tolist(), strict=False):
+                        found[i] = int(f.slots[node])
         finally:
             torch.set_num_threads(threads)
         return found

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from baselines.learned.imitation import FitConfig
 from baselines.learned.network import NetworkConfig
-from polyexplore_gym.config import DriveConfig, EnvConfig, ExplorationConfig, from_mapping
+from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.errors import InvalidConfigError
 from polyexplore_gym.floorplan import list_suites
 
@@ -145,8 +145,11 @@ class ValidationConfig:
         return tuple(self.suites.split())
 
 
+_ENVIRONMENT: dict[str, dict[str, Any]] = {"drive": {"mode": "kinematic"}, "exploration": {"placement": "in_front"}}
+
+
 def _environment() -> EnvConfig:
-    return EnvConfig(drive=DriveConfig(mode="kinematic"), exploration=ExplorationConfig(placement="in_front"))
+    return from_mapping(EnvConfig, _ENVIRONMENT)
 
 
 CURRICULUM = (
@@ -198,7 +201,7 @@ def train_config(values: Mapping[str, Any], path: str = "config") -> TrainConfig
         raise InvalidConfigError(f"{path}: expected a mapping, got {type(values).__name__}")
     values = dict(values)
     stages = values.pop("stages", None)
-    base = dataclasses.asdict(_environment())
+    base: dict[str, Any] = dict(_ENVIRONMENT)
     env = values.pop("env", {})
     if not isinstance(env, Mapping):
         raise InvalidConfigError(f"{path}.env: expected a mapping, got {type(env).__name__}")

@@ -55,6 +55,7 @@ def run_episode(
     except Exception as exception:
         error = f"{type(exception).__name__}: {exception}"[:2000]
     coverage = log.coverage[-1] if log.coverage else 0.0
+    outcome = log.info.get("outcome", {})
     reached = dict(zip(THRESHOLDS, log.distances_to_coverage(), strict=True))
     return EpisodeRecord(
         policy=label,
@@ -69,6 +70,10 @@ def run_episode(
         error=error,
         distance=round(log.distance[-1], 6) if log.distance else 0.0,
         coverage=round(coverage, 6),
+        unreached=int(outcome.get("unreached", 0)),
+        unreached_length=round(float(outcome.get("unreached_length", 0.0)), 6),
+        given_up=int(outcome.get("given_up", 0)),
+        given_up_length=round(float(outcome.get("given_up_length", 0.0)), 6),
         distance_90=reached[90],
         distance_95=reached[95],
         distance_99=reached[99],
@@ -113,13 +118,21 @@ def _play(
         if observer is not None:
             observer(env, info, action, terminated or truncated)
         if terminated or truncated:
-            return "complete" if terminated else "truncated"
+            return _status(info) if terminated else "truncated"
         began = time.perf_counter()
         action = policy.act(observation, info, rng)
         log.latency.append(time.perf_counter() - began)
         observation, reward, terminated, truncated, info = env.step(action)
         log.reward += float(reward)
         log.add(info)
+
+
+def _status(info: Mapping[str, Any]) -> str:
+    """How an episode that ended by itself ended, by the environment's word."""
+    status = info["outcome"]["status"]
+    if status not in ("complete", "unreached"):
+        raise ValueError(f"the episode has ended, but info['outcome'] says {status!r}")
+    return str(status)
 
 
 class _Log:

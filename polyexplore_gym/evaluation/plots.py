@@ -16,7 +16,7 @@ from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
 from polyexplore_gym.evaluation.statistics import Interval, coverage_at, mean_band, proportion_band
-from polyexplore_gym.evaluation.summary import Comparison, Summary, completed
+from polyexplore_gym.evaluation.summary import Comparison, Summary, finished
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,15 +37,15 @@ def coverage_figure(
     """Coverage against the distance driven: mean over the starts, with its 95 % interval over buildings.
 
     Distances are divided by what the reference policy drove on the same plan, start and placement to
-    complete the map, so that small and large plans can be averaged. Only starts that all policies
-    completed at a placement are in it (as in `summarize`); one panel a placement. Of many policies only the
+    the end, so that small and large plans can be averaged. Only starts that all policies
+    finished at a placement are in it (as in `summarize`); one panel a placement. Of many policies only the
     reference has its interval.
     """
     placements = list(dict.fromkeys(r.placement for r in records))
     policies = list(dict.fromkeys(r.policy for r in records))
     figure = _figure(4.6 * len(placements) + 0.4, 3.9)
     grid = np.linspace(0.0, 1.6, 161)
-    done = completed(records)
+    done = finished(records)
     panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
     for panel, placement in zip(panels, placements, strict=True):
         found = {(r.policy, r.plan_hash, r.seed): r for r in done if r.placement == placement}
@@ -71,7 +71,7 @@ def coverage_figure(
             if policy in (compared if len(compared) <= BANDS else [base]):
                 panel.fill_between(grid, low.clip(0, 100), high.clip(0, 100), color=color, alpha=0.12, linewidth=0)
         panel.set_title(f"{placement} ({len(pairs)} starts)", fontsize=10, color=_INK)
-        panel.set_xlabel(f"distance / that of {base} until complete" if base else "distance", fontsize=9)
+        panel.set_xlabel(f"distance / that of {base} until the end" if base else "distance", fontsize=9)
         panel.set_xlim(0.0, grid[-1])
         _plain(panel)
     panels[0].set_ylabel("area seen, %", fontsize=9)
@@ -83,12 +83,12 @@ def profile_figure(records: Sequence[EpisodeRecord], *, reference: str = "neares
     """Performance profiles (Dolan and More 2002): how often a policy is how much longer than the best one.
 
     The share of starts on which its distance is at most so many times the shortest of all policies at that
-    placement, with its 95 % interval. What was not completed is infinitely long. Starts that all policies
-    ran and one completed are in it; one panel a placement. Of many policies only the reference has its interval.
+    placement, with its 95 % interval. What was not finished is infinitely long. Starts that all policies
+    ran and one finished are in it; one panel a placement. Of many policies only the reference has its interval.
     """
     placements = list(dict.fromkeys(r.placement for r in records))
     policies = list(dict.fromkeys(r.policy for r in records))
-    done = {r.key for r in completed(records)}
+    done = {r.key for r in finished(records)}
     figure = _figure(4.6 * len(placements) + 0.4, 3.9)
     panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
     for panel, placement in zip(panels, placements, strict=True):

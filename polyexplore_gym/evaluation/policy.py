@@ -20,7 +20,7 @@ class Policy(Protocol):
     """
 
     def act(self, observation: Mapping[str, np.ndarray], info: Mapping[str, Any], rng: np.random.Generator) -> int:
-        """The node to drive to next: an index with `observation["action_mask"]` set.
+        """The node to drive to next: an index with `observation["action_mask"]` set; where none is, any index.
 
         Args:
             observation: as returned by the environment.

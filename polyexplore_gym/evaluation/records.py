@@ -11,7 +11,7 @@ from typing import Any
 
 THRESHOLDS = (90, 95, 99)
 """Percentages of coverage for which the distance is kept."""
-STATUSES = ("complete", "truncated", "failed")
+STATUSES = ("complete", "unreached", "truncated", "failed")
 _ACCEPTED: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
 
 Key = tuple[str, str, str, int]
@@ -39,13 +39,22 @@ class EpisodeRecord:
     drive: str
     """`physics` or `kinematic`."""
     status: str
-    """`complete` (nothing reachable is left), `truncated` (budget used up) or `failed` (an exception)."""
+    """`complete` (nothing is left), `unreached` (ended by itself, but jump edges stayed out of reach or were given up),
+    `truncated` (budget used up) or `failed` (an exception)."""
     error: str | None = None
     """The exception's type and text if failed."""
     distance: float = 0.0
     """Driven until the end, m."""
     coverage: float = 0.0
     """Share of the free area seen at the end, 0 to 1."""
+    unreached: int = 0
+    """Jump edges that could not be reached at the end."""
+    unreached_length: float = 0.0
+    """Their length, m."""
+    given_up: int = 0
+    """Jump edges measured or attempted in vain so often that they were given up."""
+    given_up_length: float = 0.0
+    """Their length, m."""
     distance_90: float | None = None
     """Driven at the first decision's end at which 90 % had been seen, m; None: never."""
     distance_95: float | None = None
@@ -82,8 +91,13 @@ class EpisodeRecord:
 
     @property
     def complete(self) -> bool:
-        """Whether the map was completed: only then does the distance mean anything."""
+        """Whether nothing is left."""
         return self.status == "complete"
+
+    @property
+    def ended(self) -> bool:
+        """Whether the episode ended by itself, complete or not: only then does the distance mean anything."""
+        return self.status in ("complete", "unreached")
 
     def to_json(self) -> str:
         """One line, without the line break."""
@@ -109,8 +123,8 @@ class EpisodeRecord:
             raise ValueError(f"status is {values['status']!r}, not one of {', '.join(STATUSES)}")
         if len(values["curve_distance"]) != len(values["curve_coverage"]):
             raise ValueError("curve_distance and curve_coverage differ in length")
-        if values["status"] == "complete" and not values["curve_distance"]:
-            raise ValueError("curve_distance is empty though the episode is complete")
+        if values["status"] in ("complete", "unreached") and not values["curve_distance"]:
+            raise ValueError("curve_distance is empty though the episode ended by itself")
         return cls(**values)
 
 

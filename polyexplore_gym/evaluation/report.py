@@ -26,7 +26,7 @@ from polyexplore_gym.evaluation.policy import load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.results import EPISODES, MANIFEST, read_manifest, read_plan, read_records
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
-from polyexplore_gym.evaluation.summary import Comparison, Summary, compare, completed, summarize
+from polyexplore_gym.evaluation.summary import Comparison, Summary, compare, finished, summarize
 from polyexplore_gym.evaluation.tables import interval_text, legend, summary_tables
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
         "runs": "Best and worst runs",
         "bounds": "Best possible",
     }
-    names |= {"failures": "Failures", "set-up": "Set-up"}
+    names |= {"failures": "Not complete", "set-up": "Set-up"}
     content["contents"] = [(anchor, name) for anchor, name in names.items() if content.get(anchor, True)]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("polyexplore_gym.evaluation", "."),
@@ -191,16 +191,19 @@ def _missing(study: Mapping[str, Any], records: Sequence[EpisodeRecord]) -> dict
 def _tiles(
     study: Mapping[str, Any], records: Sequence[EpisodeRecord], missing: Mapping[str, Any] | None
 ) -> list[tuple[str, str]]:
-    ended = Counter(r.status for r in records)
-    short = ended["complete"] - len(completed(records))
+    count = Counter(r.status for r in records)
+    done = finished(records)
+    short = sum(r.ended for r in records) - len(done)
+    complete = sum(r.complete for r in done)
     seconds = float(np.mean([r.timing["episode"] for r in records]))
     total = missing["total"] if missing else len(records)
     tiles = [
         ("episodes", f"{len(records)} of {total}"),
-        ("completed", str(ended["complete"] - short)),
+        ("complete", str(complete)),
+        *([("edges unreached", str(len(done) - complete))] if complete < len(done) else []),
         *([("stopped short", str(short))] if short else []),
-        *([("cut off", str(ended["truncated"]))] if ended["truncated"] else []),
-        ("failed", str(ended["failed"])),
+        *([("cut off", str(count["truncated"]))] if count["truncated"] else []),
+        ("failed", str(count["failed"])),
         ("plans, buildings", f"{len(study['plans'])}, {len({p['group'] for p in study['plans']})}"),
         ("driven in all", f"{sum(r.distance for r in records) / 1000:.1f} km"),
         ("an episode took", f"{seconds:.2f} s"),
@@ -224,14 +227,14 @@ def _figures(records: Sequence[EpisodeRecord], summary: Summary) -> list[dict[st
         {
             "title": "Performance profiles",
             "text": "How often a policy's way is at most so many times the shortest of all policies on that start. "
-            "Further up and to the left is better; what was not completed counts as infinitely long. "
+            "Further up and to the left is better; what was not finished counts as infinitely long. "
             + _band_text(records),
             "images": profiles,
         },
         {
             "title": "Coverage and distance",
             "text": f"Mean share of the free area seen by the time a part of {summary.reference}'s distance on that "
-            "start is driven; starts that all policies completed. " + _band_text(records),
+            "start is driven; starts that all policies finished. " + _band_text(records),
             "images": curves,
         },
     ]
@@ -334,10 +337,10 @@ def _runs(
         "beside it; no policy and no plan twice. They were run again for the picture, from the ring to "
         "the robot."
     )
-    base = {(r.placement, r.plan_hash, r.seed): r for r in completed(records) if r.policy == reference}
+    base = {(r.placement, r.plan_hash, r.seed): r for r in finished(records) if r.policy == reference}
     pairs = [
         (r, base[key])
-        for r in completed(records)
+        for r in finished(records)
         if r.policy != reference and (key := (r.placement, r.plan_hash, r.seed)) in base and base[key].distance > 0
     ]
     pairs.sort(key=lambda pair: pair[0].distance / pair[1].distance)
@@ -401,33 +404,40 @@ def _drawn(
 
 
 def _failures(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
-    done = {r.key for r in completed(records)}
-    bad = sorted(
-        (r for r in records if r.key not in done), key=lambda r: ("failed", "truncated", "complete").index(r.status)
-    )
-    words = {"failed": "failed", "truncated": "cut off", "complete": "stopped short"}
+    """The episodes that are not complete, the worst kind first."""
+    done = {r.key for r in finished(records)}
+    kinds = ("failed", "cut off", "stopped short", "unreached")
+
+    def kind(r: EpisodeRecord) -> str:
+        if r.ended:
+            return "unreached" if r.key in done else "stopped short"
+        return "failed" if r.status == "failed" else "cut off"
+
+    bad = sorted((r for r in records if not (r.complete and r.key in done)), key=lambda r: kinds.index(kind(r)))
     rows = [
         [
             r.policy,
             r.placement,
             r.plan,
             str(r.seed),
-            words[r.status],
+            kind(r),
             f"{r.distance:.1f}",
             f"{100 * r.coverage:.1f}",
+            f"{r.unreached + r.given_up}, {r.unreached_length + r.given_up_length:.1f} m",
             r.error or "",
         ]
         for r in bad[:_LISTED]
     ]
     text = (
-        "Cut off: the budget of decisions was used up. Stopped short: ended having seen less of the plan than others."
+        "Cut off: the budget of decisions was used up. Stopped short: ended having seen less of the plan than others. "
+        "Unreached: ended by itself and is compared, but jump edges could not be reached or were given up."
     )
     if len(bad) > _LISTED:
         text += f" The first {_LISTED} of {len(bad)}."
     return {
         "text": text,
         "rows": rows,
-        "header": ("policy", "placement", "plan", "seed", "what", "m", "seen %", "error"),
+        "header": ("policy", "placement", "plan", "seed", "what", "m", "seen %", "edges left", "error"),
     }
 
 

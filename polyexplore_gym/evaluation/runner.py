@@ -24,7 +24,7 @@ from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy, p
 from polyexplore_gym.evaluation.records import EpisodeRecord, Key
 from polyexplore_gym.evaluation.results import ResultsFile, open_folder
 
-FORMAT = 1
+FORMAT = 2
 """Raised when the files' layout changes."""
 
 MakeEnv = Callable[[EnvConfig], gymnasium.Env]

@@ -2,10 +2,12 @@
 
 Failed and truncated episodes are counted, never averaged in: a policy that gives up early has driven
 little. Means, and everything that compares, use only the (plan, seed) pairs that all policies
-completed at that placement; how many those are is part of the result. An episode that ended of
-itself but saw less than another one on the same plan (by more than `SHORTFALL`) stopped short: it is
-counted apart too, or giving up early would look like exploring fast. A policy that completed nothing
-at a placement is left out of its comparison, so that it does not leave the others nothing.
+finished at that placement; how many those are is part of the result. Finished is what ended by
+itself, whether complete or with jump edges that it could not reach; those are counted apart, and told.
+An episode that ended by itself but saw less than another one on the same plan (by more than
+`SHORTFALL`) stopped short: it is not finished, or giving up early would look like exploring fast. A
+policy that finished nothing at a placement is left out of its comparison, so that it does not leave
+the others nothing.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ from polyexplore_gym.evaluation.statistics import (
 )
 
 SHORTFALL = 0.02
-"""Share of the free area by which an episode may stay behind the most that was seen on the plan and be complete."""
+"""Share of the free area by which an episode may stay behind the most that was seen on the plan and be finished."""
 
 METRICS: dict[str, Callable[[EpisodeRecord], float | None]] = {
     "distance": lambda r: r.distance,
@@ -68,7 +70,11 @@ class Row:
     placement: str
     episodes: int
     complete: int
+    """Finished, and nothing is left."""
+    unreached: int
+    """Finished, with jump edges left that could not be reached or were given up."""
     short: int
+    """Ended by itself, having seen less of the plan than others."""
     truncated: int
     failed: int
     metrics: dict[str, Metric]
@@ -77,7 +83,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One policy at one placement against another, over the pairs that both sides completed."""
+    """One policy at one placement against another, over the pairs that both sides finished."""
 
     ours: tuple[str, str]
     """Policy and placement."""
@@ -146,26 +152,26 @@ def summarize(
     if reference not in policies:
         reference = policies[0]
     by_key = {(r.policy, r.placement, (r.plan_hash, r.seed)): r for r in records}
-    table = _Table(by_key, {r.key for r in completed(records)}, rng, resamples, confidence)
+    table = _Table(by_key, {r.key for r in finished(records)}, rng, resamples, confidence)
 
     rows: list[Row] = []
     against: list[Comparison] = []
     notes: list[str] = []
     common: dict[str, list[Pair]] = {}
     for placement in placements:
-        compared = [p for p in policies if table.completed(p, placement)]
-        common[placement] = _common_pairs(table.completed(p, placement) for p in compared)
+        compared = [p for p in policies if table.finished(p, placement)]
+        common[placement] = _common_pairs(table.finished(p, placement) for p in compared)
         notes += _notes(records, placement, policies, compared, len(common[placement]))
     horizons = table.horizons(policies, common)
     for placement in placements:
-        compared = [p for p in policies if table.completed(p, placement)]
+        compared = [p for p in policies if table.finished(p, placement)]
         found = table.rows(policies, compared, placement, common[placement], horizons, bounds or {})
         rows += sorted(found, key=_sort_key)
         against += table.against(reference, compared, placement, common[placement])
     between: list[Comparison] = []
     for placement in placements[1:]:
         sides = [((p, placement), (p, placements[0])) for p in policies]
-        pairs = [_common_pairs(table.completed(*side) for side in two) for two in sides]
+        pairs = [_common_pairs(table.finished(*side) for side in two) for two in sides]
         kept = [i for i, p in enumerate(pairs) if p]
         between += table.compare([sides[i] for i in kept], [pairs[i] for i in kept])
     return Summary(reference, rows, against, between, bounds or {}, notes)
@@ -179,24 +185,24 @@ def compare(
     resamples: int = 2000,
     confidence: float = 0.95,
 ) -> list[Comparison]:
-    """`Summary.against_reference` alone, for a part of the records; empty where the reference completed nothing."""
+    """`Summary.against_reference` alone, for a part of the records; empty where the reference finished nothing."""
     policies = list(dict.fromkeys(r.policy for r in records))
     by_key = {(r.policy, r.placement, (r.plan_hash, r.seed)): r for r in records}
-    table = _Table(by_key, {r.key for r in completed(records)}, rng, resamples, confidence)
+    table = _Table(by_key, {r.key for r in finished(records)}, rng, resamples, confidence)
     found: list[Comparison] = []
     for placement in dict.fromkeys(r.placement for r in records):
-        compared = [p for p in policies if table.completed(p, placement)]
-        common = _common_pairs(table.completed(p, placement) for p in compared)
+        compared = [p for p in policies if table.finished(p, placement)]
+        common = _common_pairs(table.finished(p, placement) for p in compared)
         found += table.against(reference, compared, placement, common)
     return found
 
 
-def completed(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
-    """The records that count as complete: ended of themselves, and not short of what was seen on the plan."""
+def finished(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """The records that are compared: ended by themselves, and not short of what was seen on the plan."""
     most: dict[str, float] = {}
     for r in records:
         most[r.plan_hash] = max(most.get(r.plan_hash, 0.0), r.coverage)
-    return [r for r in records if r.complete and r.coverage >= most[r.plan_hash] - SHORTFALL]
+    return [r for r in records if r.ended and r.coverage >= most[r.plan_hash] - SHORTFALL]
 
 
 class _Table:
@@ -205,21 +211,21 @@ class _Table:
     def __init__(
         self,
         records: dict[tuple[str, str, Pair], EpisodeRecord],
-        complete: set[Key],
+        finished: set[Key],
         rng: np.random.Generator,
         resamples: int,
         confidence: float,
     ) -> None:
         self._records = records
-        self._complete = complete
+        self._finished = finished
         self._confidence = confidence
         self._interval = functools.partial(bootstrap_interval, rng=rng, resamples=resamples, confidence=confidence)
 
-    def completed(self, policy: str, placement: str) -> list[Pair]:
+    def finished(self, policy: str, placement: str) -> list[Pair]:
         return [
             pair
             for (p, where, pair), r in self._records.items()
-            if (p, where) == (policy, placement) and r.key in self._complete
+            if (p, where) == (policy, placement) and r.key in self._finished
         ]
 
     def horizons(self, policies: list[str], common: dict[str, list[Pair]]) -> dict[str, float]:
@@ -229,7 +235,7 @@ class _Table:
             for policy in policies:
                 for pair in pairs:
                     record = self._records.get((policy, placement, pair))
-                    if record is not None and record.key in self._complete:
+                    if record is not None and record.key in self._finished:
                         longest[pair[0]] = max(longest.get(pair[0], 0.0), record.distance)
         return longest
 
@@ -254,10 +260,9 @@ class _Table:
         for policy in policies:
             own = [r for (p, where, _), r in self._records.items() if (p, where) == (policy, placement)]
             if own:
-                ended = Counter(r.status for r in own)
-                complete = sum(r.key in self._complete for r in own)
-                counts = complete, ended["complete"] - complete, ended["truncated"], ended["failed"]
-                found.append(Row(policy, placement, len(own), *counts, metrics=metrics[policy]))
+                count = Counter("short" if r.ended and r.key not in self._finished else r.status for r in own)
+                counts = {name: count[name] for name in ("complete", "unreached", "short", "truncated", "failed")}
+                found.append(Row(policy, placement, len(own), **counts, metrics=metrics[policy]))
         return found
 
     def against(self, reference: str, compared: list[str], placement: str, pairs: list[Pair]) -> list[Comparison]:
@@ -312,9 +317,9 @@ def _auc(record: EpisodeRecord, horizons: dict[str, float]) -> float:
     return area_under_coverage(distance, coverage, horizons[record.plan_hash])
 
 
-def _common_pairs(completed: Iterable[list[Pair]]) -> list[Pair]:
+def _common_pairs(finished: Iterable[list[Pair]]) -> list[Pair]:
     """Pairs that are in all lists, in the order of the first."""
-    lists = list(completed)
+    lists = list(finished)
     if not lists:
         return []
     others = [set(pairs) for pairs in lists[1:]]
@@ -332,23 +337,32 @@ def _notes(
     here = [r for r in records if r.placement == placement]
     pairs = {(r.plan_hash, r.seed) for r in here}
     notes = [
-        f"{placement}: compared on {common} of {len(pairs)} starts, those completed by all {len(compared)} policies"
+        f"{placement}: compared on {common} of {len(pairs)} starts, those finished by all {len(compared)} policies"
     ]
     left_out = [p for p in policies if p not in compared and any(r.policy == p for r in records)]
     if left_out:
-        notes.append(f"{placement}: left out of the comparison, as nothing was completed: {', '.join(left_out)}")
+        notes.append(f"{placement}: left out of the comparison, as nothing was finished: {', '.join(left_out)}")
     errors = [r for r in here if r.status == "failed"]
     for r in errors[:3]:
         notes.append(f"{placement}: {r.policy} failed on {r.plan} (seed {r.seed}): {(r.error or '?').splitlines()[0]}")
     if len(errors) > 3:
         notes.append(f"{placement}: {len(errors) - 3} more failed; see the field `error` of the records")
-    short = sum(r.complete for r in here) - sum(r.placement == placement for r in completed(records))
+    left = [r for r in finished(records) if r.placement == placement and not r.complete]
+    if left:
+        notes.append(f"{placement}: {len(left)} episodes that are compared left jump edges: {_left(left)}")
+    short = sum(r.ended for r in here) - sum(r.placement == placement for r in finished(records))
     if short:
         notes.append(
             f"{placement}: {short} episodes ended having seen over {100 * SHORTFALL:.0f} % less of a plan than others "
-            "did: stopped short, not complete"
+            "did: stopped short, not compared"
         )
     cut = sum(r.cut_nodes > 0 or r.cut_lines > 0 for r in here)
     if cut:
         notes.append(f"{placement}: in {cut} episodes the observation had no room for all nodes or lines at some time")
     return notes
+
+
+def _left(records: Sequence[EpisodeRecord]) -> str:
+    n, lost = sum(r.unreached for r in records), sum(r.unreached_length for r in records)
+    m, vain = sum(r.given_up for r in records), sum(r.given_up_length for r in records)
+    return f"{n} ({lost:.1f} m) out of reach, {m} ({vain:.1f} m) given up"

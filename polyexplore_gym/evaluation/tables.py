@@ -18,11 +18,13 @@ _HEADER = ("placement", "policy", "complete", *_FIGURES)
 _BOUNDS = {"/stops": "over_stops", "/sensing": "over_sensing", "/lower": "over_lower"}
 _COMPARISON_HEADER = ("placement", "policy", "against", "pairs", "ratio", "P(shorter)", "p", "p Holm")
 LEGEND = """\
-distance: mean driven until no reachable jump edge was left, m, with its 95 % interval; IQM: its interquartile mean;
-seen%: mean share of the free area seen by then; 90%, 95%, 99%: mean driven until so much was seen, m; AUC: mean
-coverage over the longest distance compared on the plan; scans, time (s), bumps: means an episode; ms: mean decision.
-ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): probability of the shorter way on the
-same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: the mean stands on so many starts only."""
+complete: episodes that left nothing, of all; unreached: those that ended by themselves, but with jump edges that could
+not be reached or were given up; short: those that saw less of the plan than others. All figures are over the complete
+and the unreached ones. distance: mean driven until no reachable jump edge was left, m, with its 95 % interval; IQM: its
+interquartile mean; seen%: mean share of the free area seen by then; 90%, 95%, 99%: mean driven until so much was seen,
+m; AUC: mean coverage over the longest distance compared on the plan; scans, time (s), bumps: means an episode; ms: mean
+decision. ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): probability of the shorter way
+on the same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: so many starts only."""
 LEGEND_BOUNDS = """\
 /stops, /sensing, /lower: mean of the distance over that of the best known tour which knows the plan and scans at
 stops, over that of the best known one which knows it and senses all round all the way, and over the proven lower bound
@@ -81,7 +83,7 @@ def write_tables(summary: Summary, folder: Path) -> list[Path]:
 def summary_csv(summary: Summary) -> str:
     """Every figure of every row, with its interval, one row a policy and placement."""
     names = [*METRICS, "auc", *(RATIOS if summary.bounds else ())]
-    header = ["policy", "placement", "episodes", "complete", "short", "truncated", "failed"]
+    header = ["policy", "placement", "episodes", "complete", "unreached", "short", "truncated", "failed"]
     for name in names:
         header += [
             f"{name}_{part}" for part in ("pairs", "mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high")
@@ -89,7 +91,7 @@ def summary_csv(summary: Summary) -> str:
     lines: list[list[object]] = []
     for row in summary.rows:
         line: list[object] = [row.policy, row.placement, row.episodes, row.complete]
-        line += [row.short, row.truncated, row.failed]
+        line += [row.unreached, row.short, row.truncated, row.failed]
         for name in names:
             metric = row.metrics.get(name)
             line += [metric.pairs, *_cells(metric.mean), *_cells(metric.iqm)] if metric else [0] + [""] * 6
@@ -164,9 +166,8 @@ def _row(row: Row, bounds: bool) -> list[str]:
 
 def _counts(row: Row) -> str:
     text = f"{row.complete}/{row.episodes}"
-    extra = [
-        f"{n} {word}" for n, word in ((row.short, "short"), (row.truncated, "cut off"), (row.failed, "failed")) if n
-    ]
+    counts = {"unreached": row.unreached, "short": row.short, "cut off": row.truncated, "failed": row.failed}
+    extra = [f"{n} {word}" for word, n in counts.items() if n]
     return f"{text} ({', '.join(extra)})" if extra else text
 
 

@@ -1,5 +1,5 @@
 """What has been seen, where it is open, where to stand next, and how to get there."""
 
-from polyexplore_gym.exploration.map import Chains, ExplorationMap
+from polyexplore_gym.exploration.map import ExplorationMap, JumpEdges, Remains
 
-__all__ = ["Chains", "ExplorationMap"]
+__all__ = ["ExplorationMap", "JumpEdges", "Remains"]

@@ -1,24 +1,75 @@
 """Jump edges: the open boundary of everything seen, kept incrementally as directed pieces and chains.
 
 A piece is a short segment with the unknown on its right. Touching pieces form a chain; a chain that
-is long enough to matter is a jump edge.
+is wide enough to matter is a jump edge.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, subtract
 from polyexplore_gym.exploration.segments import point_segment_distance
+from polyexplore_gym.exploration.tolerances import noise_at
 
-_MAX_INTERVALS = 64
 _PARALLEL = 0.5
 """Sine of the largest angle between a wall and an open edge that it covers."""
 _MAX_TURN = 1.3
 """A chain that turns farther (rad) than this from its beginning is cut: its parts face different ways."""
+_SQUARE = 0.26
+"""Cosine of the largest incidence (75 degrees) under which a look shows what is behind an open edge."""
+_LOOKS = 2
+"""Fewest beams across a gap of interest with which a look shows what is behind it (Ekman's sampling condition)."""
+
+
+class Pieces(NamedTuple):
+    """Open edges, one row each."""
+
+    segments: np.ndarray
+    """(m, 4) ends, m; the unknown lies on the right"""
+    kind: np.ndarray
+    """(m,) `scan_polygon` label"""
+    sigma: np.ndarray
+    """(m,) noise of where it lies, m"""
+    visits: np.ndarray
+    """(m,) halves: measurements made for it in vain count two, attempts that ended before its node one"""
+    settled: np.ndarray
+    """(m,) a scan that could have shown what is behind it showed nothing"""
+    retried: np.ndarray
+    """(m,) it was given up, and got one more visit before the end"""
+    owner: np.ndarray
+    """(m,) id of the chain, -1 for none"""
+
+    @classmethod
+    def none(cls) -> Pieces:
+        """No open edges."""
+        i = np.zeros(0, np.int64)
+        return cls(np.zeros((0, 4)), i.astype(np.int8), np.zeros(0), i, i.astype(np.bool_), i.astype(np.bool_), i)
+
+
+class Opened(NamedTuple):
+    """New chains, one row each."""
+
+    id: np.ndarray
+    """(c,)"""
+    length: np.ndarray
+    """(c,) of its pieces, m"""
+    width: np.ndarray
+    """(c,) with the gaps between its pieces and on to the walls at its ends, m"""
+    middle: np.ndarray
+    """(c, 2) point at half the length"""
+    normal: np.ndarray
+    """(c, 2) unit vector into the unknown"""
+    ends: np.ndarray
+    """(c, 4)"""
+    kind: np.ndarray
+    """(c,) of most of it"""
+    visits: np.ndarray
+    """(c,) halves"""
 
 
 @njit(cache=True)
@@ -61,12 +112,13 @@ def _covered(ax, ay, bx, by, wall, margin):
 
 
 @njit(cache=True)
-def _take_off(ax, ay, bx, by, walls, margin, same_way, kept, n_kept, cut):
+def _take_off(ax, ay, bx, by, walls, margin, same_way, kept, n_kept):
     """Take off the intervals `kept` of a-b what walls along it cover; `same_way`: only those that run as a-b does."""
     x0 = min(ax, bx) - margin
     x1 = max(ax, bx) + margin
     y0 = min(ay, by) - margin
     y1 = max(ay, by) + margin
+    cut = np.empty((1, 2))
     for w in range(walls.shape[0]):
         if (
             max(walls[w, 0], walls[w, 2]) < x0
@@ -80,21 +132,33 @@ def _take_off(ax, ay, bx, by, walls, margin, same_way, kept, n_kept, cut):
         if hi > lo:
             cut[0, 0] = lo
             cut[0, 1] = hi
-            n_kept = subtract(kept, n_kept, cut, 1)
+            kept, n_kept = subtract(kept, n_kept, cut, 1)
             if n_kept == 0:
                 break
-    return n_kept
+    return kept, n_kept
 
 
 @njit(cache=True)
-def clip(pieces, apexes, headings, points, rays, first, last, angles, full, reach, nudge, walls, margin, shortest):
-    """Clip pieces (m, 4) by scan polygons `first` to `last` and by walls along them.
+def _part(segment, lo, hi, out):
+    """The part of a segment from share lo to share hi of its length."""
+    dx = segment[2] - segment[0]
+    dy = segment[3] - segment[1]
+    out[0] = segment[0] + lo * dx
+    out[1] = segment[1] + lo * dy
+    out[2] = segment[0] + hi * dx
+    out[3] = segment[1] + hi * dy
 
-    A piece is resolved where the point `nudge` metres on its unknown side lies in a scan polygon: so
-    two coincident edges that face the same way never delete each other. Returns the remaining
-    pieces, the index of the piece each comes from, and which pieces changed.
+
+@njit(cache=True)
+def clip(pieces, sigma, scans, first, last, walls, tol):
+    """Clip pieces (m, 4) with noise `sigma` (m,) by scan polygons `first` to `last` and by walls along them.
+
+    A piece is resolved where the point `tol.nudge` and the noise beyond it, on its unknown side, lies in a scan
+    polygon: so two coincident edges that face the same way never delete each other. Returns the remaining pieces, the
+    index of the piece each comes from, and which pieces changed.
     """
     m = pieces.shape[0]
+    reach = tol.max_range + tol.gap
     near = np.empty(max(last - first, 1), np.int64)
     n_near = 0
     if m > 0:
@@ -103,57 +167,52 @@ def clip(pieces, apexes, headings, points, rays, first, last, angles, full, reac
         y0 = min(pieces[:, 1].min(), pieces[:, 3].min()) - reach
         y1 = max(pieces[:, 1].max(), pieces[:, 3].max()) + reach
         for s in range(first, last):
-            if x0 <= apexes[s, 0] <= x1 and y0 <= apexes[s, 1] <= y1:
+            if x0 <= scans.apexes[s, 0] <= x1 and y0 <= scans.apexes[s, 1] <= y1:
                 near[n_near] = s
                 n_near += 1
     out = np.empty((2 * m + 64, 4))
     origin = np.empty(out.shape[0], np.int64)
     changed = np.zeros(m, np.bool_)
-    kept = np.empty((_MAX_INTERVALS, 2))
-    cut = np.empty((_MAX_INTERVALS, 2))
+    cut = np.empty((scans.angles.size + 2, 2))
     count = 0
     for i in range(m):
         ax, ay, bx, by = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
         size = math.hypot(bx - ax, by - ay)
-        kept[0, 0] = 0.0
-        kept[0, 1] = 1.0
-        n_kept = 1
         if size <= 0.0:
             changed[i] = True
             continue
-        ox = nudge * (by - ay) / size
-        oy = -nudge * (bx - ax) / size
+        kept = np.empty((1, 2))
+        kept[0, 0] = 0.0
+        kept[0, 1] = 1.0
+        n_kept = 1
         for q in range(n_near):
             s = near[q]
-            px = apexes[s, 0]
-            py = apexes[s, 1]
-            if point_segment_distance(px, py, ax, ay, bx, by) > reach:
+            px = scans.apexes[s, 0]
+            py = scans.apexes[s, 1]
+            away = point_segment_distance(px, py, ax, ay, bx, by)
+            if away > reach:
                 continue
+            nudge = (tol.nudge + 2.0 * max(sigma[i], noise_at(away, tol))) / size
+            ox = nudge * (by - ay)
+            oy = nudge * (ax - bx)
             n_cut = inside_intervals(
                 ax + ox - px, ay + oy - py, bx + ox - px, by + oy - py,
-                points[s], rays[s], angles, headings[s], full, cut,
+                scans.points[s], scans.rays[s], scans.angles, scans.headings[s], scans.full, cut,
             )  # fmt: skip
-            n_kept = subtract(kept, n_kept, cut, n_cut)
+            kept, n_kept = subtract(kept, n_kept, cut, n_cut)
             if n_kept == 0:
                 break
         if n_kept > 0:
-            n_kept = _take_off(ax, ay, bx, by, walls, margin, False, kept, n_kept, cut)
+            kept, n_kept = _take_off(ax, ay, bx, by, walls, tol.cover, False, kept, n_kept)
         if n_kept != 1 or kept[0, 0] > 1e-9 or kept[0, 1] < 1.0 - 1e-9:
             changed[i] = True
         for r in range(n_kept):
-            if (kept[r, 1] - kept[r, 0]) * size < shortest and changed[i]:
+            if (kept[r, 1] - kept[r, 0]) * size < tol.crumb and changed[i]:
                 continue
             if count == out.shape[0]:
-                bigger = np.empty((2 * count, 4))
-                bigger[:count] = out
-                out = bigger
-                longer = np.empty(2 * count, np.int64)
-                longer[:count] = origin
-                origin = longer
-            out[count, 0] = ax + kept[r, 0] * (bx - ax)
-            out[count, 1] = ay + kept[r, 0] * (by - ay)
-            out[count, 2] = ax + kept[r, 1] * (bx - ax)
-            out[count, 3] = ay + kept[r, 1] * (by - ay)
+                out = np.concatenate((out, np.empty_like(out)))
+                origin = np.concatenate((origin, np.empty_like(origin)))
+            _part(pieces[i], kept[r, 0], kept[r, 1], out[count])
             origin[count] = i
             count += 1
     return out[:count].copy(), origin[:count].copy(), changed
@@ -168,31 +227,66 @@ def clip_known(pieces, known, margin, shortest):
     m = pieces.shape[0]
     out = np.empty((2 * m + 64, 4))
     origin = np.empty(out.shape[0], np.int64)
-    kept = np.empty((_MAX_INTERVALS, 2))
-    cut = np.empty((1, 2))
     count = 0
     for i in range(m):
         ax, ay, bx, by = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
         size = math.hypot(bx - ax, by - ay)
+        kept = np.empty((1, 2))
         kept[0, 0] = 0.0
         kept[0, 1] = 1.0
-        n_kept = _take_off(ax, ay, bx, by, known, margin, True, kept, 1, cut)
+        kept, n_kept = _take_off(ax, ay, bx, by, known, margin, True, kept, 1)
         for r in range(n_kept):
             whole = kept[r, 1] - kept[r, 0] == 1.0
-            if (whole or (kept[r, 1] - kept[r, 0]) * size >= shortest) and count < out.shape[0]:
-                out[count, 0] = ax + kept[r, 0] * (bx - ax)
-                out[count, 1] = ay + kept[r, 0] * (by - ay)
-                out[count, 2] = ax + kept[r, 1] * (bx - ax)
-                out[count, 3] = ay + kept[r, 1] * (by - ay)
-                origin[count] = i
-                count += 1
+            if not whole and (kept[r, 1] - kept[r, 0]) * size < shortest:
+                continue
+            if count == out.shape[0]:
+                out = np.concatenate((out, np.empty_like(out)))
+                origin = np.concatenate((origin, np.empty_like(origin)))
+            _part(pieces[i], kept[r, 0], kept[r, 1], out[count])
+            origin[count] = i
+            count += 1
     return out[:count].copy(), origin[:count].copy()
 
 
 @njit(cache=True)
-def _wake_touching(pieces, owner, stale, tolerance):
+def shown(segments, sigma, scans, s, tol):
+    """Which open edges (m, 4) scan s would have resolved if there were anything behind them: (m,) bool.
+
+    It saw the whole edge from its known side, square enough, with beams close enough, and with range to spare.
+    """
+    out = np.zeros(segments.shape[0], np.bool_)
+    px, py = scans.apexes[s]
+    for i in range(segments.shape[0]):
+        dx = segments[i, 2] - segments[i, 0]
+        dy = segments[i, 3] - segments[i, 1]
+        size = math.hypot(dx, dy)
+        if size <= 0.0:
+            continue
+        good = True
+        for share in (0.1, 0.5, 0.9):
+            x = segments[i, 0] + share * dx - px
+            y = segments[i, 1] + share * dy - py
+            away = math.hypot(x, y)
+            square = (x * dy - y * dx) / size  # distance of the apex from the edge's line, on its known side
+            if (
+                away > tol.max_range - tol.gap
+                or square < _SQUARE * away
+                or away * away * tol.step * _LOOKS > tol.gap * square
+            ):
+                good = False
+                break
+            back = (tol.nudge + 2.0 * max(sigma[i], noise_at(away, tol))) / size
+            if not contains(x - back * dy, y + back * dx, scans.points[s], scans.angles, scans.headings[s], scans.full):
+                good = False
+                break
+        out[i] = good
+    return out
+
+
+@njit(cache=True)
+def _wake_touching(segments, owner, stale, tolerance):
     """Make stale every whole chain with an end near an end of a stale piece that it could join."""
-    n = pieces.shape[0]
+    n = segments.shape[0]
     woken = True
     while woken:
         woken = False
@@ -200,26 +294,30 @@ def _wake_touching(pieces, owner, stale, tolerance):
         x1 = y1 = -math.inf
         for i in range(n):
             if stale[i]:
-                x0 = min(x0, pieces[i, 0], pieces[i, 2])
-                x1 = max(x1, pieces[i, 0], pieces[i, 2])
-                y0 = min(y0, pieces[i, 1], pieces[i, 3])
-                y1 = max(y1, pieces[i, 1], pieces[i, 3])
+                x0 = min(x0, segments[i, 0], segments[i, 2])
+                x1 = max(x1, segments[i, 0], segments[i, 2])
+                y0 = min(y0, segments[i, 1], segments[i, 3])
+                y1 = max(y1, segments[i, 1], segments[i, 3])
         for i in range(n):
             if (
                 stale[i]
                 or owner[i] < 0
-                or min(pieces[i, 0], pieces[i, 2]) > x1 + tolerance
-                or max(pieces[i, 0], pieces[i, 2]) < x0 - tolerance
-                or min(pieces[i, 1], pieces[i, 3]) > y1 + tolerance
-                or max(pieces[i, 1], pieces[i, 3]) < y0 - tolerance
+                or min(segments[i, 0], segments[i, 2]) > x1 + tolerance
+                or max(segments[i, 0], segments[i, 2]) < x0 - tolerance
+                or min(segments[i, 1], segments[i, 3]) > y1 + tolerance
+                or max(segments[i, 1], segments[i, 3]) < y0 - tolerance
             ):
                 continue
             for j in range(n):
                 if not stale[j]:
                     continue
                 if (
-                    abs(pieces[i, 0] - pieces[j, 2]) <= tolerance and abs(pieces[i, 1] - pieces[j, 3]) <= tolerance
-                ) or (abs(pieces[i, 2] - pieces[j, 0]) <= tolerance and abs(pieces[i, 3] - pieces[j, 1]) <= tolerance):
+                    abs(segments[i, 0] - segments[j, 2]) <= tolerance
+                    and abs(segments[i, 1] - segments[j, 3]) <= tolerance
+                ) or (
+                    abs(segments[i, 2] - segments[j, 0]) <= tolerance
+                    and abs(segments[i, 3] - segments[j, 1]) <= tolerance
+                ):
                     chain = owner[i]
                     for q in range(n):
                         if owner[q] == chain:
@@ -229,141 +327,160 @@ def _wake_touching(pieces, owner, stale, tolerance):
 
 
 @njit(cache=True)
-def rechain(pieces, kinds, visits, done, owner, dirty, local, kept, origin, fresh, fresh_kinds, seen_from, max_visits,
-            tolerance, shortest, longest, next_id):  # fmt: skip
-    """Replace the `local` pieces by what is left of them, add the `fresh` ones, chain what changed anew.
+def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
+    """Replace the `local` rows of `pieces` by what is `left` of them, add the `fresh` ones, chain what changed anew.
 
-    `dirty` (m,) marks pieces that changed, `kept` (k, 4) is left of `local` by `origin`; `seen_from`
-    (k,) marks those of `kept` that the scan looked at without finding more: they are done.
-    Returns the new pieces, kinds, visits, done and owner arrays (the pieces of a chain together and
-    in order), and the new chains: ids, summary (see `summarise`), ends, kinds, visits.
+    `dirty` (m,) marks rows that changed; `left` are pieces in the order of the local rows they come from, with that
+    row in place of the owner. A piece that is settled or was visited `max_visits` half times in vain is in no chain.
+    Returns the new pieces (those of a chain together and in order), and the new chains, numbered from `next_id` on.
     """
-    m = pieces.shape[0]
+    m = pieces.kind.size
     away = np.ones(m, np.bool_)
     for i in local:
         away[i] = False
-    n_rest = int(away.sum())
-    n = n_rest + kept.shape[0] + fresh.shape[0]
-    p = np.empty((n, 4))
-    kind = np.empty(n, np.int8)
-    visit = np.zeros(n, np.int64)
-    finished = np.zeros(n, np.bool_)
-    own = np.full(n, -1, np.int64)
+    n = int(away.sum()) + left.kind.size + fresh.kind.size
+    p = Pieces(
+        np.empty((n, 4)), np.empty(n, np.int8), np.empty(n), np.zeros(n, np.int64), np.zeros(n, np.bool_),
+        np.zeros(n, np.bool_), np.full(n, -1, np.int64),
+    )  # fmt: skip
     stale = np.ones(n, np.bool_)
     lost = np.zeros(next_id + 1, np.bool_)
     for i in range(m):
-        if dirty[i] and owner[i] >= 0:
-            lost[owner[i]] = True
+        if dirty[i] and pieces.owner[i] >= 0:
+            lost[pieces.owner[i]] = True
     at = 0
     k = 0
     for i in range(m):  # in the old order: the pieces of a chain stay in theirs
         if away[i]:
-            p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
-                pieces[i], kinds[i], visits[i], done[i], owner[i], dirty[i],
-            )  # fmt: skip
+            p.segments[at] = pieces.segments[i]
+            p.kind[at], p.sigma[at], p.visits[at] = pieces.kind[i], pieces.sigma[i], pieces.visits[i]
+            p.settled[at], p.retried[at], p.owner[at] = pieces.settled[i], pieces.retried[i], pieces.owner[i]
+            stale[at] = dirty[i]
             at += 1
-        while k < kept.shape[0] and local[origin[k]] == i:
-            p[at], kind[at], visit[at], finished[at], own[at], stale[at] = (
-                kept[k], kinds[i], visits[i], done[i] or seen_from[k], owner[i], dirty[i],
-            )  # fmt: skip
+        while k < left.kind.size and left.owner[k] == i:
+            p.segments[at] = left.segments[k]
+            p.kind[at], p.sigma[at], p.visits[at] = left.kind[k], left.sigma[k], left.visits[k]
+            p.settled[at], p.retried[at], p.owner[at] = left.settled[k], left.retried[k], pieces.owner[i]
+            stale[at] = dirty[i]
             at += 1
             k += 1
-    for k in range(fresh.shape[0]):
-        p[at] = fresh[k]
-        kind[at] = fresh_kinds[k]
+    for k in range(fresh.kind.size):
+        p.segments[at] = fresh.segments[k]
+        p.kind[at], p.sigma[at] = fresh.kind[k], fresh.sigma[k]
         at += 1
     for i in range(n):
-        finished[i] |= visit[i] >= max_visits
-        if own[i] >= 0 and lost[own[i]]:
+        if p.owner[i] >= 0 and lost[p.owner[i]]:
             stale[i] = True
-        if finished[i]:
-            own[i] = -1
+        if p.settled[i] or p.visits[i] >= max_visits:
+            p.owner[i] = -1
             stale[i] = False
-    _wake_touching(p, own, stale, tolerance)
+        elif p.owner[i] < 0:
+            stale[i] = True
+    _wake_touching(p.segments, p.owner, stale, tol.gap)
     rows = np.flatnonzero(stale)
-    order, offsets = link(p[rows], tolerance, shortest, longest)
-    data, ends, chain_kind, chain_visits = summarise(p[rows], kind[rows], visit[rows], order, offsets)
-    ids = np.arange(next_id, next_id + chain_kind.size)
-    for q in range(ids.size):
+    order, offsets = link(p.segments[rows], p.sigma[rows], walls, tol)
+    new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
+    for q in range(new.id.size):
         for e in range(offsets[q], offsets[q + 1]):
-            own[rows[order[e]]] = ids[q]
+            p.owner[rows[order[e]]] = new.id[q]
     arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
     return (
-        p[arranged], kind[arranged], visit[arranged], finished[arranged], own[arranged], ids, data, ends, chain_kind,
-        chain_visits,
+        Pieces(
+            p.segments[arranged], p.kind[arranged], p.sigma[arranged], p.visits[arranged], p.settled[arranged],
+            p.retried[arranged], p.owner[arranged],
+        ),
+        new,
     )  # fmt: skip
 
 
 @njit(cache=True)
-def unchanged(data, ends, gone, old_middle, old_ends):
-    """For each new chain (see `summarise`) the row in `gone` of one that was the very same, or -1."""
-    out = np.full(data.shape[0], -1, np.int64)
-    for q in range(data.shape[0]):
+def unchanged(new, which, gone, old_middle, old_ends):
+    """For each of the new chains `which` the row in `gone` of one that was the very same, or -1."""
+    out = np.full(which.size, -1, np.int64)
+    for k in range(which.size):
+        q = which[k]
+        size = new.length[q]
         for row in gone:
-            off = abs(data[q, 1] - old_middle[row, 0]) + abs(data[q, 2] - old_middle[row, 1])
-            for k in range(4):
-                off += abs(ends[q, k] - old_ends[row, k])
-            if off < 1e-6:
-                out[q] = row
+            off = abs(new.middle[q, 0] - old_middle[row, 0]) + abs(new.middle[q, 1] - old_middle[row, 1])
+            for e in range(4):
+                off += abs(new.ends[q, e] - old_ends[row, e])
+            if off < 1e-6 * size:
+                out[k] = row
                 break
     return out
 
 
 @njit(cache=True)
-def looked_at(pieces, apex, heading, points, angles, full, nudge):
-    """Whether the known side of each piece (m, 4) lies in a scan polygon: the scan saw the edge from there."""
-    out = np.zeros(pieces.shape[0], np.bool_)
-    for i in range(pieces.shape[0]):
-        dx = pieces[i, 2] - pieces[i, 0]
-        dy = pieces[i, 3] - pieces[i, 1]
-        size = max(math.hypot(dx, dy), 1e-9)
-        x = 0.5 * (pieces[i, 0] + pieces[i, 2]) - nudge * dy / size - apex[0]
-        y = 0.5 * (pieces[i, 1] + pieces[i, 3]) + nudge * dx / size - apex[1]
-        out[i] = contains(x, y, points, angles, heading, full)
-    return out
+def _walled(ax, ay, bx, by, walls, tol):
+    """Whether a wall fills the gap a-b: it lies along the middle of it."""
+    x = 0.5 * (ax + bx)
+    y = 0.5 * (ay + by)
+    for w in range(walls.shape[0]):
+        if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) <= tol.cover:
+            return True
+    return False
 
 
 @njit(cache=True)
-def _successors(pieces, tolerance):
-    """Index of the piece that begins where each piece ends (mutually nearest), or -1."""
-    n = pieces.shape[0]
+def _successors(segments, sigma, walls, tol):
+    """Index of the piece that goes on where each piece ends (mutually nearest), or -1.
+
+    First those that touch. Then across gaps smaller than the gap of interest in which no wall stands: scans from the
+    side cut an opening's boundary into parts that do not touch, but it is one opening.
+    """
+    n = segments.shape[0]
     after = np.full(n, -1, np.int64)
     before = np.full(n, -1, np.int64)
-    best_after = np.full(n, tolerance)
-    best_before = np.full(n, tolerance)
-    for i in range(n):
-        for j in range(n):
-            if i == j:
+    for wide in range(2):
+        best_after = np.full(n, math.inf)
+        best_before = np.full(n, math.inf)
+        to = np.full(n, -1, np.int64)
+        back = np.full(n, -1, np.int64)
+        for i in range(n):
+            if after[i] >= 0:
                 continue
-            d = math.hypot(pieces[j, 0] - pieces[i, 2], pieces[j, 1] - pieces[i, 3])
-            if d < best_after[i]:
-                best_after[i] = d
-                after[i] = j
-            if d < best_before[j]:
-                best_before[j] = d
-                before[j] = i
-    for i in range(n):
-        if after[i] >= 0 and before[after[i]] != i:
-            after[i] = -1
+            for j in range(n):
+                if i == j or before[j] >= 0:
+                    continue
+                dx = segments[j, 0] - segments[i, 2]
+                dy = segments[j, 1] - segments[i, 3]
+                limit = tol.gap if wide else tol.join + 2.0 * max(sigma[i], sigma[j])
+                if abs(dx) >= limit or abs(dy) >= limit:
+                    continue
+                d = math.hypot(dx, dy)
+                if d >= limit or (d >= best_after[i] and d >= best_before[j]):
+                    continue
+                if wide and _walled(segments[i, 2], segments[i, 3], segments[j, 0], segments[j, 1], walls, tol):
+                    continue
+                if d < best_after[i]:
+                    best_after[i] = d
+                    to[i] = j
+                if d < best_before[j]:
+                    best_before[j] = d
+                    back[j] = i
+        for i in range(n):
+            if to[i] >= 0 and back[to[i]] == i:
+                after[i] = to[i]
+                before[to[i]] = i
     return after
 
 
 @njit(cache=True)
-def link(pieces, tolerance, shortest, longest):
-    """Chain touching pieces (m, 4): order (m,) of the pieces, and the offsets (c + 1,) of the chains in it.
+def link(segments, sigma, walls, tol):
+    """Chain pieces (m, 4) that go on from each other: order (m,), and the offsets (c + 1,) of the chains in it.
 
-    A chain is cut where it turns, and where it grows beyond `longest`, but never so that a part
-    becomes shorter than `shortest`.
+    A chain is cut where it turns, and where it grows beyond the sensor's range, but never so that a part becomes
+    shorter than the gap of interest.
     """
-    n = pieces.shape[0]
-    after = _successors(pieces, tolerance)
+    n = segments.shape[0]
+    after = _successors(segments, sigma, walls, tol)
     has_before = np.zeros(n, np.bool_)
     for i in range(n):
         if after[i] >= 0:
             has_before[after[i]] = True
     size = np.empty(n)
     for i in range(n):
-        size[i] = math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+        size[i] = math.hypot(segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1])
     order = np.empty(n, np.int64)
     offsets = np.empty(n + 1, np.int64)
     used = np.zeros(n, np.bool_)
@@ -384,18 +501,18 @@ def link(pieces, tolerance, shortest, longest):
                 i = after[i]
             offsets[chains] = begin
             chains += 1
-            parts = max(math.ceil(total / longest), 1)
+            parts = max(math.ceil(total / tol.max_range), 1)
             aim = total / parts
             run = 0.0
             left = total
             first = order[begin]
             for e in range(begin, count):
                 i = order[e]
-                if e > offsets[chains - 1] and run >= shortest and left >= shortest:
-                    ux = pieces[first, 2] - pieces[first, 0]
-                    uy = pieces[first, 3] - pieces[first, 1]
-                    vx = pieces[i, 2] - pieces[i, 0]
-                    vy = pieces[i, 3] - pieces[i, 1]
+                if e > offsets[chains - 1] and run >= tol.gap and left >= tol.gap:
+                    ux = segments[first, 2] - segments[first, 0]
+                    uy = segments[first, 3] - segments[first, 1]
+                    vx = segments[i, 2] - segments[i, 0]
+                    vy = segments[i, 3] - segments[i, 1]
                     turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy))
                     if turn > _MAX_TURN or run + 0.5 * size[i] > aim:
                         offsets[chains] = e
@@ -409,57 +526,80 @@ def link(pieces, tolerance, shortest, longest):
 
 
 @njit(cache=True)
-def summarise(pieces, kinds, visits, order, offsets):
-    """Per chain: (c, 5) length, middle x y, normal x y into the unknown; (c, 4) its ends; kind; visits."""
+def _to_wall(x, y, walls, tol):
+    """How far an opening goes on beyond the end of its open edges: to the wall there, no farther than walls cover."""
+    limit = tol.cover + tol.join
+    best = limit
+    for w in range(walls.shape[0]):
+        best = min(best, point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]))
+    return best if best < limit else 0.0
+
+
+@njit(cache=True)
+def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
+    """What there is to say of the chains in `order` and `offsets` (see `link`)."""
     c = offsets.size - 1
-    data = np.empty((c, 5))
-    ends = np.empty((c, 4))
-    kind = np.empty(c, np.int8)
-    visit = np.empty(c, np.int64)
+    out = Opened(
+        np.arange(next_id, next_id + c), np.zeros(c), np.zeros(c), np.empty((c, 2)), np.empty((c, 2)),
+        np.empty((c, 4)), np.empty(c, np.int8), np.zeros(c, np.int64),
+    )  # fmt: skip
     for q in range(c):
         total = 0.0
+        gaps = 0.0
         per_kind = np.zeros(4)
-        visit[q] = 0
+        x0 = y0 = math.inf
+        x1 = y1 = -math.inf
         for e in range(offsets[q], offsets[q + 1]):
             i = order[e]
-            size = math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+            size = math.hypot(segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1])
             total += size
             per_kind[kinds[i]] += size
-            visit[q] = max(visit[q], visits[i])
-        kind[q] = np.argmax(per_kind)
+            x0 = min(x0, segments[i, 0], segments[i, 2])
+            x1 = max(x1, segments[i, 0], segments[i, 2])
+            y0 = min(y0, segments[i, 1], segments[i, 3])
+            y1 = max(y1, segments[i, 1], segments[i, 3])
+            out.visits[q] = max(out.visits[q], visits[i])
+            if e > offsets[q]:
+                k = order[e - 1]
+                gaps += math.hypot(segments[i, 0] - segments[k, 2], segments[i, 1] - segments[k, 3])
+        out.kind[q] = np.argmax(per_kind)
         first = order[offsets[q]]
         last = order[offsets[q + 1] - 1]
-        ends[q, 0] = pieces[first, 0]
-        ends[q, 1] = pieces[first, 1]
-        ends[q, 2] = pieces[last, 2]
-        ends[q, 3] = pieces[last, 3]
+        out.ends[q, 0] = segments[first, 0]
+        out.ends[q, 1] = segments[first, 1]
+        out.ends[q, 2] = segments[last, 2]
+        out.ends[q, 3] = segments[last, 3]
+        out.length[q] = total
+        # Round the tip of a shadow a chain may be longer than it is wide.
+        out.width[q] = min(total + gaps, math.hypot(x1 - x0, y1 - y0))
+        if out.width[q] < tol.gap:  # else wide enough
+            out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
+            out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
+            out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
         run = 0.0
-        mx = ends[q, 0]
-        my = ends[q, 1]
+        out.middle[q, 0] = out.ends[q, 0]
+        out.middle[q, 1] = out.ends[q, 1]
         px = 0.0
         py = 0.0
         for e in range(offsets[q], offsets[q + 1]):
             i = order[e]
-            size = math.hypot(pieces[i, 2] - pieces[i, 0], pieces[i, 3] - pieces[i, 1])
+            size = math.hypot(segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1])
             if run + size >= 0.5 * total and size > 0.0:
                 f = (0.5 * total - run) / size
-                mx = pieces[i, 0] + f * (pieces[i, 2] - pieces[i, 0])
-                my = pieces[i, 1] + f * (pieces[i, 3] - pieces[i, 1])
-                px = pieces[i, 2] - pieces[i, 0]
-                py = pieces[i, 3] - pieces[i, 1]
+                px = segments[i, 2] - segments[i, 0]
+                py = segments[i, 3] - segments[i, 1]
+                out.middle[q, 0] = segments[i, 0] + f * px
+                out.middle[q, 1] = segments[i, 1] + f * py
                 break
             run += size
-        cx = ends[q, 2] - ends[q, 0]
-        cy = ends[q, 3] - ends[q, 1]
+        cx = out.ends[q, 2] - out.ends[q, 0]
+        cy = out.ends[q, 3] - out.ends[q, 1]
         chord = math.hypot(cx, cy)
         if chord < 0.3 * total:
             cx = px
             cy = py
             chord = math.hypot(cx, cy)
-        chord = max(chord, 1e-12)
-        data[q, 0] = total
-        data[q, 1] = mx
-        data[q, 2] = my
-        data[q, 3] = cy / chord
-        data[q, 4] = -cx / chord
-    return data, ends, kind, visit
+        chord = max(chord, 1e-300)
+        out.normal[q, 0] = cy / chord
+        out.normal[q, 1] = -cx / chord
+    return out

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL, tangent
+from polyexplore_gym.exploration.corners import BEND, CORNER, LEAF, TRAIL, Shapes, tangent
 from polyexplore_gym.exploration.segments import (
     crossing_free,
     norm,
@@ -21,15 +21,20 @@ from polyexplore_gym.exploration.segments import (
     sweep_free,
 )
 
-_MAX_LEAF_EDGE = 15.0
-_MAX_EDGE = 10.0
-"""Longest edges of the graph, to leaves and between corners, m."""
-_TRAIL_EDGE = 0.6
-"""Longest edge (m) from the way driven to anything else."""
-_ANCHOR = 3.0
-"""Greatest distance (m, in x and in y) of a place on the way driven from the corner that stands for it."""
-_BREATH = 0.002
-"""A wall refitted nearer by this much (m) does not cut an edge: it would flicker."""
+
+class Vertices(NamedTuple):
+    """Vertices of the graph, one row each."""
+
+    position: np.ndarray
+    """(v, 2), m"""
+    shape: Shapes
+    """(v,) what paths may do there"""
+    kind: np.ndarray
+    """(v,) CORNER, LEAF, BEND, or -1: none"""
+    owner: np.ndarray
+    """(v,) the jump edge that a leaf may look through, -1 for none"""
+    relaxed: np.ndarray
+    """(v,) clearance that a leaf can offer where it stands: a bumped robot may stand nearer to a wall than paths do"""
 
 
 class Links(NamedTuple):
@@ -147,8 +152,8 @@ def isolate(vertices, links):
 @njit(cache=True, inline="always")
 def _hit(ax, ay, bx, by, length, want, walls, discs):
     """Whether a wall comes nearer to a-b than `want`; `discs` (m, 3) hold the inflated walls."""
-    ux = (bx - ax) / max(length, 1e-9)
-    uy = (by - ay) / max(length, 1e-9)
+    ux = (bx - ax) / length if length > 0.0 else 1.0
+    uy = (by - ay) / length if length > 0.0 else 0.0
     for w in range(walls.shape[0]):
         cx = discs[w, 0] - ax
         cy = discs[w, 1] - ay
@@ -156,17 +161,18 @@ def _hit(ax, ay, bx, by, length, want, walls, discs):
             continue
         if abs(ux * cx + uy * cy - 0.5 * length) > discs[w, 2] + 0.5 * length:
             continue
-        if segment_distance(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < want - _BREATH:
+        if segment_distance(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < want:
             return True
     return False
 
 
 @njit(cache=True)
-def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls, need):
+def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
     """Remove the corners and edges that new walls (m, 4) come too near to, and all edges of vertices that are gone.
 
     Returns the open edges (k, 2) that were cut, and which of the `blocked` ones (b, 2) are left.
     """
+    position, shape, kind = vertices.position, vertices.shape, vertices.kind
     cut = np.empty((256, 2), np.int64)
     count = 0
     discs = np.empty((walls.shape[0], 3))
@@ -175,17 +181,17 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
     for w in range(walls.shape[0]):
         discs[w, 0] = 0.5 * (walls[w, 0] + walls[w, 2])
         discs[w, 1] = 0.5 * (walls[w, 1] + walls[w, 3])
-        discs[w, 2] = 0.5 * norm(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + need
-        x0 = min(x0, walls[w, 0] - need, walls[w, 2] - need)
-        x1 = max(x1, walls[w, 0] + need, walls[w, 2] + need)
-        y0 = min(y0, walls[w, 1] - need, walls[w, 3] - need)
-        y1 = max(y1, walls[w, 1] + need, walls[w, 3] + need)
+        discs[w, 2] = 0.5 * norm(walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]) + tol.need
+        x0 = min(x0, walls[w, 0] - tol.need, walls[w, 2] - tol.need)
+        x1 = max(x1, walls[w, 0] + tol.need, walls[w, 2] + tol.need)
+        y0 = min(y0, walls[w, 1] - tol.need, walls[w, 3] - tol.need)
+        y1 = max(y1, walls[w, 1] + tol.need, walls[w, 3] + tol.need)
     for v in range(n_vertices):
         x = position[v, 0]
         y = position[v, 1]
-        if kind[v] == CORNER and shape[v, 6] < TRAIL and x0 <= x <= x1 and y0 <= y <= y1:
+        if (kind[v] == CORNER or kind[v] == BEND) and shape.limit[v] < TRAIL and x0 <= x <= x1 and y0 <= y <= y1:
             for w in range(walls.shape[0]):
-                if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < need - 0.008:
+                if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < tol.sweep:
                     kind[v] = -1
                     break
         if kind[v] < 0 and links.degree[v] > 0:
@@ -209,11 +215,12 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
         bx = position[v, 0]
         by = position[v, 1]
         if max(ax, bx) >= x0 and min(ax, bx) <= x1 and max(ay, by) >= y0 and min(ay, by) <= y1:
-            keep[e] = not _hit(ax, ay, bx, by, norm(bx - ax, by - ay), blocked_want[e], walls, discs)
-    for u in range(n_vertices):
+            want = blocked_want[e] - tol.still
+            keep[e] = not _hit(ax, ay, bx, by, norm(bx - ax, by - ay), want, walls, discs)
+    for u in range(n_vertices if walls.shape[0] > 0 else 0):
         ax = position[u, 0]
         ay = position[u, 1]
-        far = _MAX_LEAF_EDGE
+        far = tol.last_leg
         if links.degree[u] == 0 or ax < x0 - far or ax > x1 + far or ay < y0 - far or ay > y1 + far:
             continue
         h = links.first[u]
@@ -227,7 +234,7 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
                 and min(ax, bx) <= x1
                 and max(ay, by) >= y0
                 and min(ay, by) <= y1
-                and _hit(ax, ay, bx, by, links.cost[h], links.want[h], walls, discs)
+                and _hit(ax, ay, bx, by, links.cost[h], links.want[h] - tol.still, walls, discs)
             ):
                 if count == cut.shape[0]:
                     cut = np.concatenate((cut, np.empty_like(cut)))
@@ -241,34 +248,39 @@ def sever(position, kind, shape, n_vertices, links, blocked, blocked_want, walls
     return cut[:count].copy(), keep
 
 
+@njit(cache=True, inline="always")
+def _open(u, v, vertices, pieces, slack):
+    """Whether no open edge lies between two vertices, but near leaves and those that they may look through."""
+    return crossing_free(
+        vertices.position[u, 0], vertices.position[u, 1], vertices.position[v, 0], vertices.position[v, 1], pieces,
+        vertices.owner[u], vertices.owner[v],
+        slack if vertices.kind[u] == LEAF else 0.0, slack if vertices.kind[v] == LEAF else 0.0,
+    )  # fmt: skip
+
+
 @njit(cache=True)
-def unblocked(blocked, position, kind, box, pieces, p_start, p_items, owner, vertex_owner, slack):
+def unblocked(blocked, vertices, box, pieces, slack):
     """Which of the blocked edges (b, 2) that meet `box` (x0, y0, x1, y1) no open edge crosses any more."""
+    position = vertices.position
     free = np.zeros(blocked.shape[0], np.bool_)
     for e in range(blocked.shape[0]):
         u = blocked[e, 0]
         v = blocked[e, 1]
-        ax = position[u, 0]
-        ay = position[u, 1]
-        bx = position[v, 0]
-        by = position[v, 1]
-        if max(ax, bx) < box[0] or min(ax, bx) > box[2] or max(ay, by) < box[1] or min(ay, by) > box[3]:
+        if (
+            max(position[u, 0], position[v, 0]) < box[0]
+            or min(position[u, 0], position[v, 0]) > box[2]
+            or max(position[u, 1], position[v, 1]) < box[1]
+            or min(position[u, 1], position[v, 1]) > box[3]
+        ):
             continue
-        free[e] = crossing_free(
-            ax, ay, bx, by, pieces, p_start, p_items, owner, vertex_owner[u], vertex_owner[v],
-            slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
-        )  # fmt: skip
+        free[e] = _open(u, v, vertices, pieces, slack)
     return free
 
 
 @njit(cache=True)
-def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, pieces, p_start, p_items, owner,
-            vertex_owner, need, relaxed, slack):  # fmt: skip
-    """New edges between the `fresh` vertices and all others: (e, 2) vertices, lengths, needs, and which are open.
-
-    `relaxed[v]` is the clearance that a leaf can offer where it stands (a bumped robot may stand
-    nearer to a wall than paths do); `slack` how near (m) to a leaf an open edge may be crossed.
-    """
+def connect(fresh, vertices, n_vertices, walls, pieces, tol):
+    """New edges between the `fresh` vertices and all others: (e, 2) vertices, lengths, needs, and which are open."""
+    position, shape, kind = vertices.position, vertices.shape, vertices.kind
     capacity = 256
     pairs = np.empty((capacity, 2), np.int64)
     length = np.empty(capacity)
@@ -287,20 +299,22 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
         for v in range(n_vertices):
             dx = position[v, 0] - ux
             dy = position[v, 1] - uy
-            if abs(dx) > _MAX_LEAF_EDGE or abs(dy) > _MAX_LEAF_EDGE or kind[v] < 0 or rank[v] > i or v == u:
+            if abs(dx) > tol.last_leg or abs(dy) > tol.last_leg or kind[v] < 0 or rank[v] > i or v == u:
                 continue
             d = norm(dx, dy)
-            if d > (_MAX_LEAF_EDGE if kind[u] == LEAF or kind[v] == LEAF else _MAX_EDGE):
+            if d > (tol.last_leg if kind[u] == LEAF or kind[v] == LEAF else tol.leg):
                 continue
-            if d > _TRAIL_EDGE and max(shape[u, 6], shape[v, 6]) >= TRAIL:
+            if d > tol.trail_edge and max(shape.limit[u], shape.limit[v]) >= TRAIL:
                 continue
-            d1 = max(d, 1e-9)
-            if kind[u] == CORNER and not tangent(dx / d1, dy / d1, d, ux, uy, shape, u):
+            d1 = d if d > 0.0 else 1.0
+            if kind[u] != LEAF and not tangent(dx / d1, dy / d1, d, ux, uy, shape, u, tol.short_leg):
                 continue
-            if kind[v] == CORNER and not tangent(dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape, v):
+            if kind[v] != LEAF and not tangent(
+                dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape, v, tol.short_leg
+            ):
                 continue
-            want = min(need, relaxed[u], relaxed[v])
-            if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, w_start, w_items, want):
+            want = min(tol.sweep, vertices.relaxed[u], vertices.relaxed[v])
+            if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, want):
                 continue
             if count == capacity:
                 capacity *= 2
@@ -312,11 +326,7 @@ def connect(fresh, position, shape, kind, n_vertices, walls, w_start, w_items, p
             pairs[count, 1] = v
             length[count] = d
             wants[count] = want
-            free[count] = crossing_free(
-                ux, uy, position[v, 0], position[v, 1], pieces, p_start, p_items, owner,
-                vertex_owner[u], vertex_owner[v],
-                slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
-            )  # fmt: skip
+            free[count] = _open(u, v, vertices, pieces, tol.slack)
             count += 1
     return pairs[:count].copy(), length[:count].copy(), wants[:count].copy(), free[:count].copy()
 
@@ -347,17 +357,18 @@ def components(links, kind, n_vertices):
 
 
 @njit(cache=True)
-def anchors(points, position, kind, n_vertices, walls, w_start, w_items, pieces, p_start, p_items, owner, need):
+def anchors(points, vertices, n_vertices, walls, pieces, tol):
     """A corner (k,) that the disc can go to straight from each of the points (k, 2), or -1."""
+    position, kind = vertices.position, vertices.kind
     out = np.full(points.shape[0], -1, np.int64)
     for i in range(points.shape[0]):
         x = points[i, 0]
         y = points[i, 1]
         for v in range(n_vertices):
-            if kind[v] != CORNER or abs(position[v, 0] - x) > _ANCHOR or abs(position[v, 1] - y) > _ANCHOR:
+            if kind[v] != CORNER or abs(position[v, 0] - x) > tol.anchor or abs(position[v, 1] - y) > tol.anchor:
                 continue
-            if sweep_free(x, y, position[v, 0], position[v, 1], walls, w_start, w_items, need) and crossing_free(
-                x, y, position[v, 0], position[v, 1], pieces, p_start, p_items, owner, -2, -2, 0.0, 0.0
+            if sweep_free(x, y, position[v, 0], position[v, 1], walls, tol.sweep) and crossing_free(
+                x, y, position[v, 0], position[v, 1], pieces, -2, -2, 0.0, 0.0
             ):
                 out[i] = v
                 break

@@ -7,34 +7,23 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
-from polyexplore_gym.exploration.corners import Known
+from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph
+from polyexplore_gym.exploration.scan_polygon import Scans
+from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
-_PIECE = 2.0
-"""Open edges are cut into pieces of at most this length, m."""
-_SLACK = 0.3
-"""Paths may cross an open edge this near (m) to the node or robot at their end."""
-_TRAIL_STEP = 0.3
-"""Spacing of the way points on a way driven, m."""
-_BACK = 1.0
-"""In contact with walls on both sides the robot goes back so far (m) at most before paths begin."""
-_SAME_PLACE = 0.001
-"""Points of the way driven this near (m) are one place."""
-_AT_NODE = 0.75
-"""A jump edge counts as measured from its node only within this distance (m) of where that should be."""
-_ON_EDGE = 0.4
+VISIT = 8
+"""A measurement made for a jump edge in vain counts so much: an attempt that ended before its node counts one."""
 _AHEAD = 0.5
-"""And, farther than this (m) from its middle, only with this cosine or more to its normal."""
-_SPARE = 0.05
-"""Paths round corners keep this much more than the robot's radius, m."""
+"""A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
 
 
 @njit(cache=True)
@@ -56,21 +45,22 @@ def _near(segments, alive, x, y, reach):
     return rows[:count].copy()
 
 
-def _resampled(way: np.ndarray) -> np.ndarray:
-    """Points (k, 2) of a way every `_TRAIL_STEP` m, and the last: the same ones again when the way has grown."""
+def _resampled(way: np.ndarray, step: float) -> np.ndarray:
+    """Points (k, 2) of a way every `step` m, and the last: the same ones again when the way has grown."""
     run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
-    at = np.append(np.arange(0.0, run[-1], _TRAIL_STEP), run[-1])
+    at = np.append(np.arange(0.0, run[-1], step), run[-1])
     return np.stack((np.interp(at, run, way[:, 0]), np.interp(at, run, way[:, 1])), axis=1)
 
 
-@dataclass(slots=True)
-class Chains:
+class JumpEdges(NamedTuple):
     """The jump edges, one row each; `node` and what follows describe the node in front of it."""
 
     id: np.ndarray
     """(c,) identity: kept as long as the jump edge does not change."""
     length: np.ndarray
     """(c,) l_n, m."""
+    width: np.ndarray
+    """(c,) of the opening: with the gaps in it, on to the walls at its ends, m."""
     middle: np.ndarray
     """(c, 2) point at half the length."""
     normal: np.ndarray
@@ -80,7 +70,7 @@ class Chains:
     kind: np.ndarray
     """(c,) `scan_polygon` label of most of it."""
     visits: np.ndarray
-    """(c,) measurements made for it in vain, and attempts that ended before its node, which count half."""
+    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count an eighth."""
     node: np.ndarray
     """(c, 3) position and heading of the node."""
     vertex: np.ndarray
@@ -91,23 +81,52 @@ class Chains:
     """(c,) c_n from the robot, m; inf where there is no path."""
 
     @classmethod
-    def none(cls) -> Chains:
-        """An empty table."""
-        z = np.zeros(0)
-        i = np.zeros(0, np.int64)
-        return cls(i, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i,
-                   np.zeros((0, 3)), i, z, z)  # fmt: skip
+    def new(cls, opened: Opened, which: np.ndarray) -> JumpEdges:
+        """Some of the chains as jump edges that have no node yet."""
+        m = len(which)
+        return cls(
+            opened.id[which], opened.length[which], opened.width[which], opened.middle[which], opened.normal[which],
+            opened.ends[which], opened.kind[which], -(-opened.visits[which] // VISIT), np.zeros((m, 3)),
+            np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
+        )  # fmt: skip
 
-    def __len__(self) -> int:
+    @property
+    def size(self) -> int:
+        """How many there are."""
         return len(self.id)
 
-    def take(self, rows: np.ndarray) -> Chains:
+    def take(self, rows: np.ndarray) -> JumpEdges:
         """The table of some rows."""
-        return Chains(*(getattr(self, name)[rows] for name in self.__slots__))
+        return JumpEdges(*(column[rows] for column in self))
 
-    def join(self, other: Chains) -> Chains:
+    def join(self, other: JumpEdges) -> JumpEdges:
         """Both tables, one below the other."""
-        return Chains(*(np.concatenate((getattr(self, n), getattr(other, n))) for n in self.__slots__))
+        return JumpEdges(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
+
+class Remains(NamedTuple):
+    """What an exploration left open."""
+
+    unreached: int
+    """Jump edges that no place in reach sees."""
+    unreached_length: float
+    """Their length together, m."""
+    given_up: int
+    """Jump edges measured or attempted in vain too often."""
+    given_up_length: float
+    """Their length together, m."""
+
+
+def _nothing() -> Opened:
+    z, i = np.zeros(0), np.zeros(0, np.int64)
+    return Opened(i, z, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i)
+
+
+_EVERYWHERE = np.array([-math.inf, -math.inf, math.inf, math.inf])
+
+
+def _no_box() -> np.ndarray:
+    return np.array([math.inf, math.inf, -math.inf, -math.inf])
 
 
 class ExplorationMap:
@@ -120,35 +139,41 @@ class ExplorationMap:
         """`radius` of the robot's disc, m."""
         self.config = config
         self.sensor = sensor
-        self.min_gap = 2.0 * radius if config.min_gap is None else config.min_gap
-        noise = math.hypot(sensor.sigma_range, 0.5 * sensor.sigma_angle * sensor.max_range)
-        self.nudge = 0.03 + 2.0 * noise
-        self.cover = 0.04 + 3.0 * sensor.sigma_range
-        self.join = 0.05 + 2.0 * noise
-        self.full = sensor.full_circle
+        self.tol = tolerances(config, sensor, radius)
+        self.least_width = self.tol.gap - 3.0 * sensor.sigma_range
+        """Openings narrower than this are no jump edges: the robot's diameter, less what noise may take off."""
         n = sensor.beams
         self.n_scans = 0
-        self.apexes = np.zeros((16, 2))
-        self.headings = np.zeros(16)
-        self.points = np.zeros((16, n, 2))
-        self.rays = np.zeros((16, n, 2))
-        self.labels: list[np.ndarray] = []
-        self.angles = np.zeros(n)
-        self.pieces = np.zeros((0, 4))
-        self.kinds = np.zeros(0, np.int8)
-        self.visits = np.zeros(0, np.int64)  # in halves: an attempt that ends before the node counts half
-        self.done = np.zeros(0, np.bool_)
-        self.owner = np.zeros(0, np.int64)
-        self.chains = Chains.none()
-        self.graph = PathGraph(radius, _SPARE, 0.012, _SLACK)
+        self._apexes = np.zeros((16, 2))
+        self._headings = np.zeros(16)
+        self._points = np.zeros((16, n, 2))
+        self._rays = np.zeros((16, n, 2))
+        self._angles = np.zeros(n)
+        self.pieces = Pieces.none()
+        self.chains = JumpEdges.new(_nothing(), np.zeros(0, np.int64))
+        self.graph = self._wide = PathGraph(self.tol)
+        self._tight: PathGraph | None = None
+        """Paths through passages that the noise closes: made when nothing else is in reach."""
+        self._tight_touched: list[np.ndarray] = []
         self.robot = -1
         self._start: list[tuple[float, float]] = []
         self._next_id = 0
         self._trail: list[np.ndarray] = []
         self._touched: list[np.ndarray] = []
-        self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
+        self._felt: list[tuple[float, float, float, float, float]] = []
+        self._walls = np.zeros((0, 4))
+        self._box = _no_box()
 
     # Scans -----------------------------------------------------------------------------------
+
+    @property
+    def scans(self) -> Scans:
+        """The scan polygons so far (views)."""
+        n = self.n_scans
+        return Scans(
+            self._apexes[:n], self._headings[:n], self._points[:n], self._rays[:n], self._angles,
+            self.sensor.full_circle, self.sensor.max_range,
+        )  # fmt: skip
 
     def insert(
         self,
@@ -172,36 +197,39 @@ class ExplorationMap:
         if point_segment is None:
             point_segment = np.full(len(scan.angles), -1, np.int64)
         s = self._store(scan, ranges)
+        scans, tol, full = self.scans, self.tol, self.sensor.full_circle
         x, y = float(scan.pose[0]), float(scan.pose[1])
-        reach = self.sensor.max_range + 0.1
+        reach = tol.max_range + tol.gap
         self._touched.append(touched)
         self._box = np.array([
             min(self._box[0], x - reach), min(self._box[1], y - reach),
             max(self._box[2], x + reach), max(self._box[3], y + reach),
         ])  # fmt: skip
         near_walls = walls[_near(walls, alive, x, y, reach)]
-        labels = scan_polygon.label_edges(
-            scan.angles, ranges, point_segment, self.sensor.max_range, self.sensor.sigma_range,
-            self.sensor.sigma_angle, self.min_gap, self.full,
-        )  # fmt: skip
-        self.labels.append(labels)
-        fresh, fresh_kinds = scan_polygon.open_edges(self.points[s], labels, self.sensor.max_range, _PIECE, self.full)
+        labels = scan_polygon.label_edges(ranges, point_segment, full, tol)
+        fresh, kinds, sigmas = scan_polygon.open_edges(scans.points[s], labels, full, tol)
         fresh += np.array([x, y, x, y])
-        fresh, origin, _ = self._clip(fresh, 0, s, near_walls)
-        fresh_kinds = fresh_kinds[origin]
+        fresh, origin, _ = jump_edges.clip(fresh, sigmas, scans, 0, s, near_walls, tol)
+        kinds, sigmas = kinds[origin], sigmas[origin]
 
-        local = _near(self.pieces, np.ones(len(self.pieces), np.bool_), x, y, reach)
-        kept, origin, changed = self._clip(self.pieces[local], s, s + 1, near_walls)
-        fresh, again = jump_edges.clip_known(fresh, kept, self.nudge, 0.02)
-        fresh_kinds = fresh_kinds[again]
-        dirty = np.zeros(len(self.pieces), np.bool_)
+        p = self.pieces
+        local = _near(p.segments, np.ones(len(p.kind), np.bool_), x, y, reach)
+        kept, origin, changed = jump_edges.clip(p.segments[local], p.sigma[local], scans, s, s + 1, near_walls, tol)
+        rows = local[origin]
+        fresh, again = jump_edges.clip_known(fresh, kept, tol.nudge + 2.0 * tol.sigma_range, tol.crumb)
+        shown = jump_edges.shown(kept, p.sigma[rows], scans, s, tol)
+        visits = p.visits.copy()
+        dirty = np.zeros(len(p.kind), np.bool_)
         dirty[local[changed]] = True
+        dirty[rows[shown & ~p.settled[rows]]] = True
         if target is not None:
-            mine = self.owner == target
-            arrived = arrived and self._measured(target, x, y)
-            self.visits[mine] += 2 if arrived else 1
+            mine = p.owner == target
+            visits[mine] += VISIT if arrived and self._measured(target, x, y) else 1
             dirty |= mine
-        self._rechain(local, kept, origin, dirty, fresh, fresh_kinds, s, target if arrived else None)
+        p = p._replace(visits=visits)
+        left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
+        new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
+        self._rechain(p, dirty, local, left, new, near_walls)
         if target is not None:
             self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
@@ -213,78 +241,54 @@ class ExplorationMap:
         dx, dy = self.chains.middle[row[0]] - (x, y)
         distance = math.hypot(dx, dy)
         ahead = dx * self.chains.normal[row[0], 0] + dy * self.chains.normal[row[0], 1]
-        front = self.config.front_distance if self.config.placement == "in_front" else 0.0
-        return distance <= front + _AT_NODE and (distance <= _ON_EDGE or ahead >= _AHEAD * distance)
+        return distance <= self._front + self.tol.at_node and (
+            distance <= self.tol.on_edge or ahead >= _AHEAD * distance
+        )
+
+    @property
+    def _front(self) -> float:
+        return self.tol.front if self.config.placement == "in_front" else 0.0
 
     def _store(self, scan: Scan, ranges: np.ndarray) -> int:
         s = self.n_scans
-        if s == len(self.headings):
-            self.apexes = np.concatenate((self.apexes, np.zeros_like(self.apexes)))
-            self.headings = np.concatenate((self.headings, np.zeros_like(self.headings)))
-            self.points = np.concatenate((self.points, np.zeros_like(self.points)))
-            self.rays = np.concatenate((self.rays, np.zeros_like(self.rays)))
-        self.apexes[s] = scan.pose[:2]
-        self.headings[s] = scan.pose[2]
-        self.angles = scan.angles
-        self.points[s], self.rays[s] = scan_polygon.corner_points(
-            scan.angles, ranges, float(scan.pose[2]), self.sensor.max_range
+        if s == len(self._headings):
+            self._apexes = np.concatenate((self._apexes, np.zeros_like(self._apexes)))
+            self._headings = np.concatenate((self._headings, np.zeros_like(self._headings)))
+            self._points = np.concatenate((self._points, np.zeros_like(self._points)))
+            self._rays = np.concatenate((self._rays, np.zeros_like(self._rays)))
+        self._apexes[s] = scan.pose[:2]
+        self._headings[s] = scan.pose[2]
+        self._angles = scan.angles
+        self._points[s], self._rays[s] = scan_polygon.corner_points(
+            scan.angles, ranges, float(scan.pose[2]), self.tol.max_range
         )
         self.n_scans += 1
         return s
 
-    def _clip(
-        self, pieces: np.ndarray, first: int, last: int, walls: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return jump_edges.clip(
-            pieces, self.apexes, self.headings, self.points, self.rays, first, last, self.angles, self.full,
-            self.sensor.max_range + 0.2, self.nudge, walls, self.cover, 0.02,
-        )  # fmt: skip
-
     def _rechain(
-        self,
-        local: np.ndarray,
-        kept: np.ndarray,
-        origin: np.ndarray,
-        dirty: np.ndarray,
-        fresh: np.ndarray,
-        fresh_kinds: np.ndarray,
-        scan: int,
-        measured: int | None,
+        self, pieces: Pieces, dirty: np.ndarray, local: np.ndarray, left: Pieces, fresh: Pieces, walls: np.ndarray
     ) -> None:
         """Put what is left of the local pieces and the fresh ones in their place; make new chains where needed."""
-        finished = np.zeros(len(kept), np.bool_)
-        if measured is not None:
-            finished = jump_edges.looked_at(
-                kept, self.apexes[scan], self.headings[scan], self.points[scan], self.angles, self.full, self.nudge
-            ) & (self.owner[local[origin]] == measured)
-        self.pieces, self.kinds, self.visits, self.done, self.owner, ids, data, ends, kind, visits = (
-            jump_edges.rechain(
-                self.pieces, self.kinds, self.visits, self.done, self.owner, dirty, local, kept, origin, fresh,
-                fresh_kinds, finished, 2 * self.config.max_visits, self.join, self.min_gap, self.sensor.max_range,
-                self._next_id,
-            )
-        )  # fmt: skip
-        alive = np.zeros(self._next_id + len(ids) + 1, np.bool_)
-        self._next_id += len(ids)
-        alive[self.owner] = True  # the last one stands for pieces without a chain
+        done, opened = jump_edges.rechain(
+            pieces, dirty, local, left, fresh, walls, VISIT * self.config.max_visits, self._next_id, self.tol
+        )
+        self.pieces, new = Pieces(*done), Opened(*opened)
+        owner = self.pieces.owner
+        alive = np.zeros(self._next_id + len(new.id) + 1, np.bool_)
+        self._next_id += len(new.id)
+        alive[owner] = True  # the last one stands for pieces without a chain
         c = self.chains
         staying = alive[c.id]
-        long_enough = np.flatnonzero(data[:, 0] >= self.min_gap)
+        wide = np.flatnonzero(new.width >= self.least_width)
         gone = np.flatnonzero(~staying)
-        again = jump_edges.unchanged(data[long_enough], ends[long_enough], gone, c.middle, c.ends)
-        for q, row in zip(long_enough, again, strict=True):
+        again = jump_edges.unchanged(new, wide, gone, c.middle, c.ends)
+        for q, row in zip(wide, again, strict=True):
             if row >= 0:
-                self.owner[self.owner == ids[q]] = c.id[row]
-                c.visits[row], c.kind[row] = (visits[q] + 1) // 2, kind[q]
+                owner[owner == new.id[q]] = c.id[row]
+                c.visits[row], c.kind[row] = -(-new.visits[q] // VISIT), new.kind[q]
                 staying[row] = True
         self._drop_vertices(c.vertex[~staying])
-        new = long_enough[again < 0]
-        m = len(new)
-        added = Chains(
-            ids[new], data[new, 0], data[new, 1:3], data[new, 3:5], ends[new], kind[new], (visits[new] + 1) // 2,
-            np.zeros((m, 3)), np.full(m, -1, np.int64), np.zeros(m), np.full(m, math.inf),
-        )  # fmt: skip
-        self.chains = c.take(np.flatnonzero(staying)).join(added)
+        self.chains = c.take(np.flatnonzero(staying)).join(JumpEdges.new(new, wide[again < 0]))
 
     def _drop_nodes(self, which: np.ndarray) -> None:
         self._drop_vertices(self.chains.vertex[which])
@@ -296,10 +300,27 @@ class ExplorationMap:
             self.graph.remove_leaves(vertices)
 
     def bump(self, pose: np.ndarray, bearing: float) -> None:
-        """Remember an obstacle felt at `bearing` (rad, map frame) on the robot's rim at `pose` (3,): plan around it."""
+        """Remember an obstacle felt at `bearing` (rad, map frame) on the robot's rim at `pose` (3,): plan around it.
+
+        Felt again at the same spot, it is twice as wide: so that no way leads into it for ever.
+        """
         c, s = math.cos(bearing), math.sin(bearing)
-        x, y = pose[0] + self.graph.radius * c, pose[1] + self.graph.radius * s
-        self.graph.add_felt(np.array([x + 0.01 * s, y - 0.01 * c, x - 0.01 * s, y + 0.01 * c]))
+        r = self.tol.radius
+        x, y = pose[0] + r * c, pose[1] + r * s
+        half = 0.04 * r
+        for fx, fy, before, _, _ in self._felt:
+            if math.hypot(fx - x, fy - y) < 0.08 * r:
+                half = max(half, min(2.0 * before, r))
+        self._felt.append((x, y, half, c, s))
+        for graph in (self._wide, self._tight):
+            if graph is not None:
+                self._put_felt(graph, x, y, half, c, s)
+
+    def _put_felt(self, graph: PathGraph, x: float, y: float, half: float, c: float, s: float) -> None:
+        # Felt walls stand where they are: no path may squeeze into them.
+        near = self.tol.need - graph.tol.need
+        x, y = x - near * c, y - near * s
+        graph.add_felt(np.array([x + half * s, y - half * c, x - half * s, y + half * c]))
 
     # Nodes and paths -------------------------------------------------------------------------
 
@@ -308,40 +329,122 @@ class ExplorationMap:
 
         `came` (k, 2) is the way that it came, the way back out of a tight place.
         """
-        g, c = self.graph, self.chains
-        if self._touched:
-            g.set_walls(walls, alive, np.unique(np.concatenate(self._touched)), self._known(), self._box)
-            g.set_pieces(self.pieces, self.owner, self._box)
-            g.add_way_point(float(pose[0]), float(pose[1]))
-        if self.robot >= 0:
-            g.remove_leaves(np.array([self.robot]))
         if came is not None:
             self._trail.append(came)
-        self._start = self._way_out(float(pose[0]), float(pose[1]))
+        self._walls = walls[alive]
+        touched = np.unique(np.concatenate(self._touched)) if self._touched else np.zeros(0, np.int64)
+        self._switch(self._wide)
+        if self._touched:
+            self._show(self._wide, walls, alive, touched, self._box)
+        if self._tight is not None:
+            self._tight_touched.append(touched)
+        self._plan(pose)
+        while not self.reachable.any():
+            if self.chains.size and self._squeeze(pose, walls, alive):
+                break
+            again = self._look_again()
+            self._switch(self._wide)
+            if not again:
+                self._plan(pose)
+                break
+            self._show(self._wide, walls, alive, touched[:0], _EVERYWHERE)
+            self._box = _EVERYWHERE
+            self._plan(pose)
+        self._touched = []
+        self._box = _no_box()
+
+    def _show(
+        self, graph: PathGraph, walls: np.ndarray, alive: np.ndarray, touched: np.ndarray, box: np.ndarray
+    ) -> None:
+        """Let a path graph know what is new."""
+        graph.set_walls(walls, alive, touched, self.scans, box)
+        graph.set_pieces(self.pieces.segments, self.pieces.sigma, self.pieces.owner, box)
+
+    def _switch(self, graph: PathGraph) -> None:
+        """Use another path graph: all nodes are placed anew."""
+        if graph is self.graph:
+            return
+        self._drop_nodes(np.arange(self.chains.size))
+        if self.robot >= 0:
+            self.graph.remove_leaves(np.array([self.robot]))
+            self.robot = -1
+        self.graph = graph
+        self._box = _EVERYWHERE
+
+    def _squeeze(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> bool:
+        """Look for ways through passages that the noise of the map closes. Whether one leads to a node."""
+        if self._tight is None:
+            self._tight = PathGraph(squeezed(self.tol))
+            self._tight_touched = [np.arange(len(walls))]
+            for felt in self._felt:
+                self._put_felt(self._tight, *felt)
+        touched = np.unique(np.concatenate(self._tight_touched)) if self._tight_touched else np.zeros(0, np.int64)
+        self._switch(self._tight)
+        self._show(self._tight, self._shortened(walls), alive, touched, _EVERYWHERE)
+        self._tight_touched = []
+        self._plan(pose)
+        return bool(self.reachable.any())
+
+    def _shortened(self, walls: np.ndarray) -> np.ndarray:
+        """Walls (m, 4) less what noise may have added at their ends: where a wall is seen at a slant, several sigma."""
+        way = walls[:, 2:] - walls[:, :2]
+        length = np.hypot(*way.T)
+        less = min(6.0 * self.tol.sigma_range, 0.25 * self.tol.radius)
+        share = np.where(length > 3.0 * less, less / np.maximum(length, 1e-300), 0.0)[:, None]
+        return np.concatenate((walls[:, :2] + share * way, walls[:, 2:] - share * way), axis=1)
+
+    def _plan(self, pose: np.ndarray) -> None:
+        """Nodes, gains and paths in the current graph."""
+        g, x, y = self.graph, float(pose[0]), float(pose[1])
+        if self._touched:
+            g.add_way_point(x, y)
+        if self.robot >= 0:
+            g.remove_leaves(np.array([self.robot]))
+        self._start = self._way_out(x, y)
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
-        reach = self.sensor.max_range
+        c = self.chains
+        reach = self.tol.max_range
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
         self._place(np.flatnonzero(local))
         self._update_paths()
-        if len(c) and not np.isfinite(c.path_length).any() and self._trail:
-            g.add_trail(_resampled(np.concatenate(self._trail)), self.robot)
+        if c.size and not self.reachable.any() and self._trail:
+            g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step), self.robot)
             self._update_paths()
             local[:] = True
-        self._place_within(np.flatnonzero(local & ~np.isfinite(c.path_length)))
-        if not np.isfinite(c.path_length).any():
+        self._place_within(np.flatnonzero(local & ~self.reachable))
+        if not self.reachable.any():
             # What is left lies behind slivers of the unknown: look at it across them.
-            self._place_within(np.arange(len(c)), through_unknown=True)
-        nodes.gains(
-            np.flatnonzero(local), c.node, c.vertex, c.middle, c.ends, c.id, self.sensor.max_range, g.walls,
-            *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, c.gain,
-        )  # fmt: skip
+            self._place_within(np.arange(c.size), through_unknown=True)
+        nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.tol, c.gain)
         g.recycle()
-        self._touched = []
-        self._box = np.array([math.inf, math.inf, -math.inf, -math.inf])
 
-    def _known(self) -> Known:
-        n = self.n_scans
-        return Known(self.apexes[:n], self.headings[:n], self.points[:n], self.angles, self.full, self.sensor.max_range)
+    def _look_again(self) -> bool:
+        """Before all ends: what was given up gets one more visit, and slits count. Whether there is any of either."""
+        p, most = self.pieces, VISIT * self.config.max_visits
+        again = ~p.settled & ~p.retried & (p.visits >= most)
+        slits = self.least_width > self.tol.slit
+        if not (slits or again.any()):
+            return False
+        self.least_width = min(self.least_width, self.tol.slit)
+        before = self.chains.size
+        p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
+        all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
+        self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
+        return self.chains.size > before or bool(again.any())
+
+    def remains(self) -> Remains:
+        """The jump edges that are left: out of reach, and given up."""
+        c, p = self.chains, self.pieces
+        wide = c.width >= self.tol.gap - 3.0 * self.tol.sigma_range
+        out = wide & ~self.reachable
+        given_up = np.flatnonzero(~p.settled & (p.visits >= VISIT * self.config.max_visits))
+        order, offsets = jump_edges.link(p.segments[given_up], p.sigma[given_up], self._walls, self.tol)
+        rows = given_up[order]
+        lost = jump_edges.summarise(
+            p.segments[rows], p.kind[rows], p.visits[rows], np.arange(len(rows)), offsets, self._walls, 0, self.tol
+        )
+        wide = lost.width >= self.tol.gap - 3.0 * self.tol.sigma_range
+        return Remains(int(out.sum()), float(c.length[out].sum()), int(wide.sum()), float(lost.length[wide].sum()))
 
     def _way_out(self, x: float, y: float) -> list[tuple[float, float]]:
         """The first way points: the place itself or, in contact with a wall, on to where paths begin.
@@ -353,15 +456,19 @@ class ExplorationMap:
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
         points, driven = [(x, y)], [0.0]
+        grain = 1.0 / self.tol.same_point
+        been = {(round(x * grain), round(y * grain)): 0}
         for px, py in itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail)):
-            been = [math.dist((px, py), p) < _SAME_PLACE for p in points]
-            if any(been):
-                first = been.index(True)
+            spot = round(px * grain), round(py * grain)
+            if spot in been:  # a loop: it led back here
+                first = been[spot]
+                been = {s: k for s, k in been.items() if k <= first} if first < len(points) - 1 else been
                 del points[first + 1 :], driven[first + 1 :]
                 continue
+            been[spot] = len(points)
             driven.append(driven[-1] + math.dist((px, py), points[-1]))
             points.append((px, py))
-            if self.graph.clearance(px, py) >= self.graph.need or driven[-1] > _BACK:
+            if self.graph.clearance(px, py) >= self.tol.need or driven[-1] > self.tol.back:
                 break
         return points
 
@@ -376,13 +483,8 @@ class ExplorationMap:
 
     def _place(self, which: np.ndarray) -> None:
         """Put the nodes of jump edges at their configured places, if the disc can stand there."""
-        g, c, config = self.graph, self.chains, self.config
-        front = config.front_distance if config.placement == "in_front" else 0.0
-        node, outcome = nodes.place(
-            which, c.node, c.vertex, c.middle, c.normal, c.length, c.id, front,
-            config.samples * self.sensor.resolution, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner,
-            g.need,
-        )  # fmt: skip
+        g = self.graph
+        node, outcome = nodes.place(which, self.chains, self._front, g.walls, g.pieces, self.tol)
         self._drop_nodes(which[outcome > 0])
         self._set_nodes(which[outcome == 2], node[outcome == 2])
 
@@ -391,12 +493,12 @@ class ExplorationMap:
         if not len(which):
             return
         g, c = self.graph, self.chains
-        seen, known = np.isfinite(g.distances(self.robot, np.arange(len(g.kind)))), self._known()
+        seen = np.isfinite(g.distances(self.robot, np.arange(g.n_vertices)))
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
         for k, i in enumerate(which):
             *node[k], found[k] = nodes.nearest_reachable(
-                np.flatnonzero(self.owner == c.id[i]), *c.middle[i], *c.normal[i], c.id[i], g.position, g.kind, seen,
-                known, g.walls, *g.wall_grid, g.pieces, *g.piece_grid, g.piece_owner, g.need, _SLACK, through_unknown,
+                np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, self.scans, g.walls, g.pieces,
+                self.tol, through_unknown,
             )  # fmt: skip
         if found.any():
             self._drop_vertices(c.vertex[which[found]])

@@ -7,31 +7,21 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.exploration.corners import REACH
 from polyexplore_gym.exploration.segments import clearance, crossing_free, norm, sweep_free
 
 _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
-_OFFSETS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0])
-_ASIDE = 0.15
-"""Distance (m) from a jump edge of the point that must be visible."""
-_SAME_PLACE = 0.4
-"""A scan within this distance (m, in x and in y) was made at the same place."""
-_SIGHT = 0.05
-"""A line of sight may end within this distance (m) of its target's own walls."""
+_OFFSETS = np.array([0.0, 0.4, 0.8, 1.2, 1.8, 2.4, 3.2, 4.0, 5.2, 6.4, 8.0])
+"""Where else to stand for a jump edge: shares of its length, and radii before it."""
+_MARGIN = 0.1
+"""A scan must have had a place this far (rad) inside its field of view to have looked there."""
 
 
 @njit(cache=True)
-def sees(ax, ay, bx, by, walls, w_start, w_items, pieces, p_start, p_items, owner, own_a, own_b):
+def sees(ax, ay, bx, by, walls, pieces, own_a, own_b, tol):
     """Whether b is in sight of a: no wall between them, and no unknown but the jump edges that own them."""
-    none = np.full(walls.shape[0], -1, np.int64)
-    return _sees(ax, ay, bx, by, walls, w_start, w_items, none, pieces, p_start, p_items, owner, own_a, own_b)
-
-
-@njit(cache=True)
-def _sees(ax, ay, bx, by, walls, w_start, w_items, no_owner, pieces, p_start, p_items, owner, own_a, own_b):
-    if not crossing_free(ax, ay, bx, by, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT):
-        return False
-    return crossing_free(ax, ay, bx, by, pieces, p_start, p_items, owner, own_a, own_b, _SIGHT, _SIGHT)
+    return crossing_free(ax, ay, bx, by, walls, -2, -2, 0.0, tol.sight) and crossing_free(
+        ax, ay, bx, by, pieces, own_a, own_b, tol.sight, tol.sight
+    )
 
 
 @njit(cache=True)
@@ -52,171 +42,165 @@ def point_along(rows, pieces, fraction):
 
 
 @njit(cache=True)
-def stands(x, y, mx, my, chain, walls, w_start, w_items, pieces, p_start, p_items, owner, need):
-    """Whether the disc may stand at (x, y) and the point (mx, my) of its jump edge is in sight."""
-    if clearance(x, y, walls, w_start, w_items, REACH) < need:
+def stands(x, y, mx, my, chain, walls, pieces, room, tol):
+    """Whether the disc may stand at (x, y), with clearance `room`, and the point (mx, my) of its jump edge is in
+    sight."""
+    if clearance(x, y, walls, tol.reach) < room:
         return False
-    if norm(mx - x, my - y) < _SIGHT:
+    if norm(mx - x, my - y) < tol.sight:
         return True
-    return sees(x, y, mx, my, walls, w_start, w_items, pieces, p_start, p_items, owner, chain, chain)
+    return sees(x, y, mx, my, walls, pieces, chain, chain, tol)
 
 
 @njit(cache=True)
-def place(which, node, vertex, middle, normal, length, chain, front, spacing, walls, w_start, w_items, pieces,
-          p_start, p_items, owner, need):  # fmt: skip
+def place(which, edges, front, walls, pieces, tol):
     """Nodes of the jump edges `which` at their configured place: (k, 3), and what came of each (k,).
 
-    The place is at most `front` m before the middle of the jump edge on its known side, and no farther than
-    `length` / `spacing` (the sampling condition). 0: the node that was there stays, or none can stand there; 1: the
-    old one must go; 2: a new one.
+    The place is at most `front` m before the middle of the jump edge on its known side, and no farther than the
+    sampling condition allows. 0: the node that was there stays, or none can stand there; 1: the old one must go; 2: a
+    new one.
     """
     out = np.zeros((which.size, 3))
     outcome = np.zeros(which.size, np.int8)
-    no_owner = np.full(walls.shape[0], -1, np.int64)
     for k in range(which.size):
         i = which[k]
-        if vertex[i] >= 0:
-            x = node[i, 0]
-            y = node[i, 1]
+        mx, my = edges.middle[i]
+        nx, ny = edges.normal[i]
+        if edges.vertex[i] >= 0:
+            x = edges.node[i, 0]
+            y = edges.node[i, 1]
             # Walls that came later may stand too near, or between the node and its jump edge.
-            if clearance(x, y, walls, w_start, w_items, REACH) >= need - 0.02 and (
-                norm(middle[i, 0] - x, middle[i, 1] - y) < 2.0 * _ASIDE
-                or crossing_free(
-                    x, y, middle[i, 0] - _ASIDE * normal[i, 0], middle[i, 1] - _ASIDE * normal[i, 1], walls, w_start,
-                    w_items, no_owner, -2, -2, 0.0, _SIGHT,
-                )
-            ):  # fmt: skip
+            if clearance(x, y, walls, tol.reach) >= tol.sweep and (
+                norm(mx - x, my - y) < 2.0 * tol.aside
+                or crossing_free(x, y, mx - tol.aside * nx, my - tol.aside * ny, walls, -2, -2, 0.0, tol.sight)
+            ):
                 continue
             outcome[k] = 1
-        d = min(front, length[i] / spacing)
-        x = middle[i, 0] - d * normal[i, 0]
-        y = middle[i, 1] - d * normal[i, 1]
-        if stands(
-            x, y, middle[i, 0], middle[i, 1], chain[i], walls, w_start, w_items, pieces, p_start, p_items, owner, need
-        ):
+        d = min(front, edges.length[i] / (tol.samples * tol.step))
+        x = mx - d * nx
+        y = my - d * ny
+        if stands(x, y, mx, my, edges.id[i], walls, pieces, tol.stand, tol):
             outcome[k] = 2
             out[k, 0] = x
             out[k, 1] = y
-            out[k, 2] = math.atan2(normal[i, 1], normal[i, 0])
+            out[k, 2] = math.atan2(ny, nx)
     return out, outcome
 
 
 @njit(cache=True)
-def _joins(x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p_start, p_items, owner, need, slack):
-    """Whether the disc can go straight from (x, y) to a vertex in `seen`."""
-    for v in range(seen.size):
-        if not seen[v] or kind[v] < 0:
+def _joins(x, y, chain, vertices, seen, walls, pieces, tol):
+    """Whether the disc can go straight from (x, y) to a vertex in `seen`; to far ones if there is none near."""
+    near = tol.way_point
+    some = False
+    for v in range(2 * seen.size):
+        far = v >= seen.size
+        if far and some:
+            break
+        v = v % seen.size
+        if not seen[v] or vertices.kind[v] < 0:
             continue
-        vx = position[v, 0]
-        vy = position[v, 1]
-        if abs(vx - x) > 8.0 or abs(vy - y) > 8.0:
+        vx, vy = vertices.position[v]
+        if (abs(vx - x) > near or abs(vy - y) > near) != far:
             continue
-        if crossing_free(x, y, vx, vy, pieces, p_start, p_items, owner, chain, chain, slack, slack) and sweep_free(
-            x, y, vx, vy, walls, w_start, w_items, need
+        some = True
+        if crossing_free(x, y, vx, vy, pieces, chain, chain, tol.slack, tol.slack) and sweep_free(
+            x, y, vx, vy, walls, tol.sweep
         ):
             return True
     return False
 
 
 @njit(cache=True)
-def looked_from(x, y, tx, ty, known):
+def looked_from(x, y, tx, ty, scans, tol):
     """Whether a scan from (x, y) or beside it had (tx, ty) in its field of view: another would show no more."""
-    for s in range(known.headings.size):
-        dx = known.apexes[s, 0] - x
-        dy = known.apexes[s, 1] - y
-        if abs(dx) < _SAME_PLACE and abs(dy) < _SAME_PLACE:
-            turn = math.atan2(ty - y, tx - x) - known.headings[s]
+    for s in range(scans.headings.size):
+        dx = scans.apexes[s, 0] - x
+        dy = scans.apexes[s, 1] - y
+        if abs(dx) < tol.same_place and abs(dy) < tol.same_place:
+            turn = math.atan2(ty - y, tx - x) - scans.headings[s]
             turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
-            if known.full or known.angles[0] + 0.1 < turn < known.angles[-1] - 0.1:
+            if scans.full or scans.angles[0] + _MARGIN < turn < scans.angles[-1] - _MARGIN:
                 return True
     return False
 
 
 @njit(cache=True)
-def nearest_reachable(rows, mx, my, nx, ny, chain, position, kind, seen, known, walls, w_start, w_items, pieces,
-                      p_start, p_items, owner, need, slack, through_unknown):  # fmt: skip
-    """The reachable place nearest to a jump edge from which it is visible: (x, y, heading, found).
+def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol, through_unknown):
+    """The reachable place nearest to jump edge i from which it is visible: (x, y, heading, found).
 
-    Tries places before the edge on its known side, then the vertices of the graph in `seen`; with
-    `through_unknown` also those between which and the edge there are no known walls but other jump
+    `rows` are its pieces. Tries places before the edge on its known side, then the vertices of the graph in `seen`;
+    with `through_unknown` also those between which and the edge there are no known walls but other jump
     edges. The heading looks at the edge. Places from which a scan has looked at it are left out.
     """
-    no_owner = np.full(walls.shape[0], -1, np.int64)
+    chain = edges.id[i]
+    mx, my = edges.middle[i]
+    nx, ny = edges.normal[i]
     for offset in _OFFSETS:
-        if through_unknown:
+        if through_unknown or offset * tol.radius > tol.max_range - tol.gap:
             break  # places before the edge were tried, and no path led there
         for fraction in _FRACTIONS:
-            px, py = point_along(rows, pieces, fraction)
-            x = px - offset * nx
-            y = py - offset * ny
-            if looked_from(x, y, px, py, known):
+            px, py = point_along(rows, pieces.segments, fraction)
+            x = px - offset * tol.radius * nx
+            y = py - offset * tol.radius * ny
+            if looked_from(x, y, px + tol.aside * nx, py + tol.aside * ny, scans, tol):
                 continue
-            if stands(
-                x, y, px, py, chain, walls, w_start, w_items, pieces, p_start, p_items, owner, need
-            ) and _joins(
-                x, y, chain, position, kind, seen, walls, w_start, w_items, pieces, p_start, p_items, owner, need,
-                slack,
-            ):  # fmt: skip
+            if stands(x, y, px, py, chain, walls, pieces, tol.need, tol) and _joins(
+                x, y, chain, vertices, seen, walls, pieces, tol
+            ):
                 return x, y, math.atan2(ny, nx), True
     # A jump edge begins at the corner that hides what is behind it: aim beside it, on its known side.
-    tx = mx - _ASIDE * nx
-    ty = my - _ASIDE * ny
-    best = 0.8 * known.reach
+    tx = mx - tol.aside * nx
+    ty = my - tol.aside * ny
+    best = tol.max_range - tol.gap
     bx = 0.0
     by = 0.0
     found = False
     for v in range(seen.size):
-        if not seen[v] or kind[v] < 0:
+        if not seen[v] or vertices.kind[v] < 0:
             continue
-        d = norm(mx - position[v, 0], my - position[v, 1])
+        vx, vy = vertices.position[v]
+        d = norm(mx - vx, my - vy)
         if d >= best:
             continue
         if through_unknown:
-            visible = crossing_free(
-                position[v, 0], position[v, 1], tx, ty, walls, w_start, w_items, no_owner, -2, -2, 0.0, _SIGHT
-            )
+            visible = crossing_free(vx, vy, tx, ty, walls, -2, -2, 0.0, tol.sight)
         else:
             # Only from the known side is the edge a window into the unknown.
-            visible = (mx - position[v, 0]) * nx + (my - position[v, 1]) * ny > 0.1 * d and sees(
-                position[v, 0], position[v, 1], tx, ty, walls, w_start, w_items, pieces, p_start, p_items, owner,
-                chain, chain,
-            )  # fmt: skip
-        if visible and not looked_from(position[v, 0], position[v, 1], tx, ty, known):
+            ahead = (mx - vx) * nx + (my - vy) * ny
+            visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(vx, vy, tx, ty, walls, pieces, chain, chain, tol)
+        if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, scans, tol):
             best = d
-            bx = position[v, 0]
-            by = position[v, 1]
+            bx = vx
+            by = vy
             found = True
-    return bx, by, math.atan2(my - by, mx - bx), found
+    return bx, by, math.atan2(my + tol.aside * ny - by, mx + tol.aside * nx - bx), found
 
 
 @njit(cache=True)
-def gains(which, node, vertex, middle, ends, chain, max_range, walls, w_start, w_items, pieces, p_start,
-          p_items, owner, out):  # fmt: skip
-    """g_n (Ekman): the sum of the angles that the jump edges subtend at node n where visible; pi for its own.
+def gains(which, edges, walls, pieces, tol, out):
+    """g_n (Ekman): the sum of the angles that the jump edges subtend at node n where their middle is visible; pi for
+    its own.
 
-    Fills `out` for the chains in `which`; jump edges farther than `max_range` are not seen.
+    Fills `out` for the chains in `which`; jump edges beyond the maximum range are not seen.
     """
-    no_owner = np.full(walls.shape[0], -1, np.int64)
     for n in which:
         total = math.pi
-        x = node[n, 0]
-        y = node[n, 1]
-        if vertex[n] < 0:
+        x = edges.node[n, 0]
+        y = edges.node[n, 1]
+        if edges.vertex[n] < 0:
             out[n] = 0.0
             continue
-        for i in range(middle.shape[0]):
+        for i in range(edges.id.size):
             if i == n:
                 continue
-            if norm(middle[i, 0] - x, middle[i, 1] - y) > max_range:
+            mx, my = edges.middle[i]
+            if norm(mx - x, my - y) > tol.max_range:
                 continue
-            if not _sees(
-                x, y, middle[i, 0], middle[i, 1], walls, w_start, w_items, no_owner, pieces, p_start, p_items, owner,
-                chain[n], chain[i],
-            ):  # fmt: skip
+            if not sees(x, y, mx, my, walls, pieces, edges.id[n], edges.id[i], tol):
                 continue
-            ax = ends[i, 0] - x
-            ay = ends[i, 1] - y
-            bx = ends[i, 2] - x
-            by = ends[i, 3] - y
+            ax = edges.ends[i, 0] - x
+            ay = edges.ends[i, 1] - y
+            bx = edges.ends[i, 2] - x
+            by = edges.ends[i, 3] - y
             total += abs(math.atan2(ax * by - ay * bx, ax * bx + ay * by))
         out[n] = total

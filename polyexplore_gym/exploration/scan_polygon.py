@@ -7,14 +7,39 @@ free space lies on the left: an open edge has the unknown on its right.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from polyexplore_gym.exploration.tolerances import noise_at
+
 WALL, JUMP, RANGE, VIEW = 0, 1, 2, 3
 
-_ARC_SAGITTA = 0.03
-"""How far (m) a chord that stands for an arc of range edges may lie inside the arc."""
+
+class Scans(NamedTuple):
+    """Scan polygons: which space is known."""
+
+    apexes: np.ndarray
+    """(s, 2) where each scan was made, m"""
+    headings: np.ndarray
+    """(s,) rad"""
+    points: np.ndarray
+    """(s, n, 2) corners about the apex, m"""
+    rays: np.ndarray
+    """(s, n, 2) unit vectors of the beams"""
+    angles: np.ndarray
+    """(n,) of the beams in the robot's frame, rad"""
+    full: bool
+    """whether the last beam neighbours the first"""
+    reach: float
+    """maximum range, m"""
+
+
+EVERYTHING = Scans(
+    np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.array([0.0, 1.0]), False, 0.0
+)
+"""No limit to what is known."""
 
 
 @njit(cache=True)
@@ -46,7 +71,7 @@ def _extrapolated(r0, r1, step):
 
 
 @njit(cache=True)
-def _same_surface(ranges, k, step, sigma_range, sigma_angle, full):
+def _same_surface(ranges, k, full, tol):
     """Whether returns k and k + 1 are explained by one local line and the noise (5 sigma)."""
     n = ranges.size
     j = (k + 1) % n
@@ -54,33 +79,32 @@ def _same_surface(ranges, k, step, sigma_range, sigma_angle, full):
     b = ranges[j]
     far = max(a, b)
     # Noise of range, plus the shift of the end points by the angle noise on a surface at 45 degrees.
-    slack = 5.0 * math.sqrt(2.0) * math.hypot(sigma_range, sigma_angle * far) + 0.05
-    if abs(a - b) <= slack + far * step:
+    slack = 5.0 * math.sqrt(2.0) * noise_at(far, tol) + tol.surface
+    if abs(a - b) <= slack + far * tol.step:
         return True
     before = (k - 1) % n
     after = (j + 1) % n
     if (k >= 1 or full) and not math.isinf(ranges[before]):
-        predicted = _extrapolated(ranges[before], a, step)
+        predicted = _extrapolated(ranges[before], a, tol.step)
         # The extrapolation amplifies the noise of its two returns about threefold.
         if abs(predicted - b) <= 3.0 * slack and (a - ranges[before]) * (b - a) > 0:
             return True
     if (j <= n - 2 or full) and not math.isinf(ranges[after]):
-        predicted = _extrapolated(ranges[after], b, step)
+        predicted = _extrapolated(ranges[after], b, tol.step)
         if abs(predicted - a) <= 3.0 * slack and (b - ranges[after]) * (a - b) > 0:
             return True
     return False
 
 
 @njit(cache=True)
-def label_edges(angles, ranges, point_segment, max_range, sigma_range, sigma_angle, min_gap, full):
+def label_edges(ranges, point_segment, full, tol):
     """Label of the edge from beam k to beam k + 1: WALL, JUMP or RANGE; (n,) or, not full, (n - 1,).
 
-    Two returns on one fitted segment, or explained by the local line and the noise, lie on one
-    surface, unless they are so far apart (`min_gap`) that a passage could hide between two beams.
+    Two returns on one fitted segment, or explained by the local line and the noise, lie on one surface, unless they
+    are so far apart (`tol.gap`) that a passage could hide between two beams: there nothing is known to be wall.
     """
-    n = angles.size
+    n = ranges.size
     m = n if full else n - 1
-    step = (angles[n - 1] - angles[0]) / (n - 1)
     labels = np.empty(m, np.int8)
     for k in range(m):
         j = (k + 1) % n
@@ -89,13 +113,13 @@ def label_edges(angles, ranges, point_segment, max_range, sigma_range, sigma_ang
         if math.isinf(a) and math.isinf(b):
             labels[k] = RANGE
         elif math.isinf(a) or math.isinf(b):
-            labels[k] = JUMP if min(a, b) < max_range - 0.1 - 3.0 * sigma_range else RANGE
+            labels[k] = JUMP if min(a, b) < tol.max_range - 2.0 * tol.surface - 3.0 * tol.sigma_range else RANGE
         else:
-            gap = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(step), 0.0))
-            if gap >= min_gap:
+            apart = math.sqrt(max(a * a + b * b - 2.0 * a * b * math.cos(tol.step), 0.0))
+            if apart >= tol.gap:
                 labels[k] = JUMP
             elif (point_segment[k] >= 0 and point_segment[k] == point_segment[j]) or _same_surface(
-                ranges, k, step, sigma_range, sigma_angle, full
+                ranges, k, full, tol
             ):
                 labels[k] = WALL
             else:
@@ -104,63 +128,82 @@ def label_edges(angles, ranges, point_segment, max_range, sigma_range, sigma_ang
 
 
 @njit(cache=True)
-def open_edges(points, labels, max_range, piece_length, full):
-    """The open boundary as directed pieces: (m, 4) about the apex, and their kinds (m,).
+def _run_end(points, labels, k, full, tol):
+    """The end (a beam number) of the open edge that begins at beam k: runs of range edges become chords."""
+    n = points.shape[0]
+    m = labels.size
+    stop = k + 1
+    if labels[k] != RANGE:
+        return stop
+    while stop < m and labels[stop] == RANGE:
+        chord = math.hypot(points[(stop + 1) % n, 0] - points[k, 0], points[(stop + 1) % n, 1] - points[k, 1])
+        if chord * chord / (8.0 * tol.max_range) > tol.sagitta or chord > tol.piece:
+            break
+        stop += 1
+    return stop
 
-    Runs of range edges become chords, long edges are cut to `piece_length` at most.
+
+@njit(cache=True)
+def _cut_up(x0, y0, x1, y1, kind, far, tol, out, kinds, sigmas, count):
+    """Append a directed edge in equal pieces of at most `tol.piece`; returns the new number of pieces."""
+    parts = max(math.ceil(math.hypot(x1 - x0, y1 - y0) / tol.piece), 1)
+    for i in range(parts):
+        f0 = i / parts
+        f1 = (i + 1) / parts
+        out[count, 0] = x0 + f0 * (x1 - x0)
+        out[count, 1] = y0 + f0 * (y1 - y0)
+        out[count, 2] = x0 + f1 * (x1 - x0)
+        out[count, 3] = y0 + f1 * (y1 - y0)
+        kinds[count] = kind
+        sigmas[count] = noise_at(far, tol)
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def open_edges(points, labels, full, tol):
+    """The open boundary as directed pieces: (m, 4) about the apex, their kinds (m,) and noise (m,), m.
+
+    Runs of range edges become chords, long edges are cut to `tol.piece` at most.
     """
     n = points.shape[0]
     m = labels.size
-    out = np.empty((4 * n + 64, 4))
-    kinds = np.empty(out.shape[0], np.int8)
-    count = 0
-    if not full:
-        # The sides of the field of view; from the apex to the first corner the free space is on the left.
-        for side in range(2):
-            x = points[0 if side == 0 else n - 1, 0]
-            y = points[0 if side == 0 else n - 1, 1]
-            parts = math.ceil(math.hypot(x, y) / piece_length)
-            for i in range(parts):
-                f0 = i / parts
-                f1 = (i + 1) / parts
-                if side == 0:
-                    out[count, 0], out[count, 1], out[count, 2], out[count, 3] = f0 * x, f0 * y, f1 * x, f1 * y
-                else:
-                    out[count, 0], out[count, 1], out[count, 2], out[count, 3] = f1 * x, f1 * y, f0 * x, f0 * y
-                kinds[count] = VIEW
-                count += 1
+    longest = 2.0 * tol.max_range  # no edge is longer
+    room = 2 * (math.ceil(longest / tol.piece) + 1)
     k = 0
     while k < m:
         if labels[k] == WALL:
             k += 1
             continue
-        stop = k + 1
-        if labels[k] == RANGE:
-            while stop < m and labels[stop] == RANGE:
-                nx = points[(stop + 1) % n, 0]
-                ny = points[(stop + 1) % n, 1]
-                chord = math.hypot(nx - points[k, 0], ny - points[k, 1])
-                if chord * chord / (8.0 * max_range) > _ARC_SAGITTA or chord > piece_length:
-                    break
-                stop += 1
-        x0 = points[k, 0]
-        y0 = points[k, 1]
-        x1 = points[stop % n, 0]
-        y1 = points[stop % n, 1]
-        parts = max(math.ceil(math.hypot(x1 - x0, y1 - y0) / piece_length), 1)
-        for i in range(parts):
-            if count == out.shape[0]:
-                break
-            f0 = i / parts
-            f1 = (i + 1) / parts
-            out[count, 0] = x0 + f0 * (x1 - x0)
-            out[count, 1] = y0 + f0 * (y1 - y0)
-            out[count, 2] = x0 + f1 * (x1 - x0)
-            out[count, 3] = y0 + f1 * (y1 - y0)
-            kinds[count] = labels[k]
-            count += 1
+        stop = _run_end(points, labels, k, full, tol)
+        size = math.hypot(points[stop % n, 0] - points[k, 0], points[stop % n, 1] - points[k, 1])
+        room += max(math.ceil(size / tol.piece), 1)
         k = stop
-    return out[:count].copy(), kinds[:count].copy()
+    out = np.empty((room, 4))
+    kinds = np.empty(room, np.int8)
+    sigmas = np.empty(room)
+    count = 0
+    if not full:
+        # The sides of the field of view; from the apex to the first corner the free space is on the left.
+        x, y = points[0, 0], points[0, 1]
+        count = _cut_up(0.0, 0.0, x, y, VIEW, math.hypot(x, y), tol, out, kinds, sigmas, count)
+        x, y = points[n - 1, 0], points[n - 1, 1]
+        count = _cut_up(x, y, 0.0, 0.0, VIEW, math.hypot(x, y), tol, out, kinds, sigmas, count)
+    k = 0
+    while k < m:
+        if labels[k] == WALL:
+            k += 1
+            continue
+        stop = _run_end(points, labels, k, full, tol)
+        x0, y0 = points[k, 0], points[k, 1]
+        x1, y1 = points[stop % n, 0], points[stop % n, 1]
+        # A range discontinuity begins at the nearer return: the noise there tells where it stands.
+        near, far = math.hypot(x0, y0), math.hypot(x1, y1)
+        count = _cut_up(
+            x0, y0, x1, y1, labels[k], min(near, far) if labels[k] == JUMP else far, tol, out, kinds, sigmas, count
+        )
+        k = stop
+    return out[:count].copy(), kinds[:count].copy(), sigmas[:count].copy()
 
 
 @njit(cache=True)
@@ -198,7 +241,7 @@ def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
     """Parts of the segment a-b (about the apex) inside the scan polygon, as intervals of [0, 1].
 
     Walks through the sectors between neighbouring beams; within one the boundary is a line, so the
-    crossing is exact. Writes (lo, hi) rows to `out` and returns how many.
+    crossing is exact. Writes (lo, hi) rows to `out` (n + 2 or more) and returns how many.
     """
     n = angles.size
     dx = bx - ax
@@ -237,7 +280,7 @@ def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
                 if hi > lo:
                     if count > 0 and lo - out[count - 1, 1] <= 1e-9:
                         out[count - 1, 1] = hi
-                    elif count < out.shape[0]:
+                    else:
                         out[count, 0] = lo
                         out[count, 1] = hi
                         count += 1
@@ -249,11 +292,26 @@ def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
 
 
 @njit(cache=True)
+def is_known(x, y, scans, since):
+    """Whether a point lies in a scan polygon from number `since` on; the newest are tried first."""
+    for s in range(scans.headings.size - 1, since - 1, -1):
+        dx = x - scans.apexes[s, 0]
+        dy = y - scans.apexes[s, 1]
+        if (
+            abs(dx) <= scans.reach
+            and abs(dy) <= scans.reach
+            and contains(dx, dy, scans.points[s], scans.angles, scans.headings[s], scans.full)
+        ):
+            return True
+    return False
+
+
+@njit(cache=True)
 def subtract(kept, n_kept, cut, n_cut):
-    """Intervals `kept` less the intervals `cut` (both ascending), in place; the new number."""
+    """Intervals `kept` less the intervals `cut` (both ascending): the rest, and their number."""
     if n_cut == 0 or n_kept == 0:
-        return n_kept
-    result = np.empty_like(kept)
+        return kept, n_kept
+    result = np.empty((n_kept + n_cut, 2))
     count = 0
     for i in range(n_kept):
         lo = kept[i, 0]
@@ -263,18 +321,15 @@ def subtract(kept, n_kept, cut, n_cut):
                 continue
             if cut[c, 0] >= hi:
                 break
-            if cut[c, 0] > lo and count < result.shape[0]:
+            if cut[c, 0] > lo:
                 result[count, 0] = lo
                 result[count, 1] = cut[c, 0]
                 count += 1
             lo = cut[c, 1]
             if lo >= hi:
                 break
-        if lo < hi and count < result.shape[0]:
+        if lo < hi:
             result[count, 0] = lo
             result[count, 1] = hi
             count += 1
-    for i in range(count):
-        kept[i, 0] = result[i, 0]
-        kept[i, 1] = result[i, 1]
-    return count
+    return result, count

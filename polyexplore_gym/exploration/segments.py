@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-CELL = 1.0
-"""Side of a grid cell, m."""
+
+class Obstacles(NamedTuple):
+    """Segments and a hashed grid over them. A bucket may hold segments of several cells: a query finds a superset."""
+
+    segments: np.ndarray
+    """(m, 4), m"""
+    owner: np.ndarray
+    """(m,) the jump edge that each belongs to, -1 for none"""
+    start: np.ndarray
+    """(buckets + 1,) where each bucket begins in `items`"""
+    items: np.ndarray
+    """rows of `segments`"""
+    cell: float
+    """side of a cell, m"""
 
 
 @njit(cache=True)
@@ -67,18 +80,15 @@ def bucket(ix, iy, mask):
 
 
 @njit(cache=True)
-def build_grid(segments, alive, margin):
-    """Hashed grid over segments: `start` (buckets + 1,) and `items`, each cell within `margin` m of it.
-
-    A bucket may hold segments of several cells: a query finds a superset.
-    """
+def indexed(segments, owner, alive, margin, cell):
+    """The living segments (m, 4) as obstacles: each stands in all cells within `margin` m of it."""
     n = segments.shape[0]
     size = 256
     while size < 4 * n:
         size *= 2
     mask = size - 1
     start = np.zeros(size + 1, np.int64)
-    reach = margin + 0.5 * math.sqrt(2.0) * CELL
+    reach = margin + 0.5 * math.sqrt(2.0) * cell
     items = np.empty(0, np.int64)
     for pass_ in range(2):
         if pass_ == 1:
@@ -93,16 +103,16 @@ def build_grid(segments, alive, margin):
             y1 = segments[i, 1]
             x2 = segments[i, 2]
             y2 = segments[i, 3]
-            ix0 = math.floor((min(x1, x2) - margin) / CELL)
-            ix1 = math.floor((max(x1, x2) + margin) / CELL)
-            iy0 = math.floor((min(y1, y2) - margin) / CELL)
-            iy1 = math.floor((max(y1, y2) + margin) / CELL)
+            ix0 = math.floor((min(x1, x2) - margin) / cell)
+            ix1 = math.floor((max(x1, x2) + margin) / cell)
+            iy0 = math.floor((min(y1, y2) - margin) / cell)
+            iy1 = math.floor((max(y1, y2) + margin) / cell)
             small = (ix1 - ix0 + 1) * (iy1 - iy0 + 1) <= 4
             for ix in range(ix0, ix1 + 1):
                 for iy in range(iy0, iy1 + 1):
                     if (
                         not small
-                        and point_segment_distance((ix + 0.5) * CELL, (iy + 0.5) * CELL, x1, y1, x2, y2) > reach
+                        and point_segment_distance((ix + 0.5) * cell, (iy + 0.5) * cell, x1, y1, x2, y2) > reach
                     ):
                         continue
                     b = bucket(ix, iy, mask)
@@ -111,59 +121,68 @@ def build_grid(segments, alive, margin):
                     else:
                         items[fill[b]] = i
                         fill[b] += 1
-    return start, items
+    return Obstacles(segments, owner, start, items, cell)
+
+
+@njit(cache=True, inline="always")
+def bucket_at(x, y, obstacles):
+    """The bucket that holds a point's cell: its rows are `items[start[b] : start[b + 1]]`."""
+    return bucket(math.floor(x / obstacles.cell), math.floor(y / obstacles.cell), obstacles.start.size - 2)
 
 
 @njit(cache=True)
-def clearance(px, py, segments, start, items, limit):
+def clearance(px, py, obstacles, limit):
     """Distance from a point to the nearest segment, or `limit` if that is less (<= the grid's margin)."""
-    mask = start.size - 2
-    b = bucket(math.floor(px / CELL), math.floor(py / CELL), mask)
+    b = bucket_at(px, py, obstacles)
+    segments = obstacles.segments
     best = limit
-    for e in range(start[b], start[b + 1]):
-        i = items[e]
+    for e in range(obstacles.start[b], obstacles.start[b + 1]):
+        i = obstacles.items[e]
         d = point_segment_distance(px, py, segments[i, 0], segments[i, 1], segments[i, 2], segments[i, 3])
         best = min(best, d)
     return best
 
 
 @njit(cache=True)
-def clearances(points, segments, start, items, limit):
+def clearances(points, obstacles, limit):
     """`clearance` of points (k, 2)."""
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
-        out[i] = clearance(points[i, 0], points[i, 1], segments, start, items, limit)
+        out[i] = clearance(points[i, 0], points[i, 1], obstacles, limit)
     return out
 
 
 @njit(cache=True, inline="always")
-def walk(ax, ay, bx, by):
+def walk(ax, ay, bx, by, cell):
     """How a-b runs through the grid: its first cell, the steps in x and y, the parameters along it of the next
     borders in x and y and what they grow by, and the number of cells (Amanatides and Woo 1987)."""
     dx = bx - ax
     dy = by - ay
-    ix = math.floor(ax / CELL)
-    iy = math.floor(ay / CELL)
-    cells = abs(math.floor(bx / CELL) - ix) + abs(math.floor(by / CELL) - iy) + 1
+    ix = math.floor(ax / cell)
+    iy = math.floor(ay / cell)
+    cells = abs(math.floor(bx / cell) - ix) + abs(math.floor(by / cell) - iy) + 1
     sx = 1 if dx > 0 else -1
     sy = 1 if dy > 0 else -1
-    tx = ((ix + (1 if dx > 0 else 0)) * CELL - ax) / dx if dx != 0.0 else math.inf
-    ty = ((iy + (1 if dy > 0 else 0)) * CELL - ay) / dy if dy != 0.0 else math.inf
-    wx = CELL / abs(dx) if dx != 0.0 else math.inf
-    wy = CELL / abs(dy) if dy != 0.0 else math.inf
+    tx = ((ix + (1 if dx > 0 else 0)) * cell - ax) / dx if dx != 0.0 else math.inf
+    ty = ((iy + (1 if dy > 0 else 0)) * cell - ay) / dy if dy != 0.0 else math.inf
+    wx = cell / abs(dx) if dx != 0.0 else math.inf
+    wy = cell / abs(dy) if dy != 0.0 else math.inf
     return ix, iy, sx, sy, tx, ty, wx, wy, cells
 
 
 @njit(cache=True)
-def sweep_free(ax, ay, bx, by, segments, start, items, radius):
+def sweep_free(ax, ay, bx, by, obstacles, radius):
     """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
+    segments = obstacles.segments
+    start = obstacles.start
+    items = obstacles.items
     mask = start.size - 2
     dx = bx - ax
     dy = by - ay
     length = norm(dx, dy)
     ux = dx / length if length > 0.0 else 1.0
     uy = dy / length if length > 0.0 else 0.0
-    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by)
+    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by, obstacles.cell)
     for _ in range(cells):
         b = bucket(ix, iy, mask)
         for e in range(start[b], start[b + 1]):
@@ -193,13 +212,17 @@ def sweep_free(ax, ay, bx, by, segments, start, items, radius):
 
 
 @njit(cache=True)
-def crossing_free(ax, ay, bx, by, segments, start, items, owner, own_a, own_b, slack_a, slack_b):
+def crossing_free(ax, ay, bx, by, obstacles, own_a, own_b, slack_a, slack_b):
     """Whether a-b crosses no segment, but within `slack_a` m of a, `slack_b` m of b, or those of its owners."""
+    segments = obstacles.segments
+    owner = obstacles.owner
+    start = obstacles.start
+    items = obstacles.items
     mask = start.size - 2
     dx = bx - ax
     dy = by - ay
     length = norm(dx, dy)
-    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by)
+    ix, iy, sx, sy, tx, ty, wx, wy, cells = walk(ax, ay, bx, by, obstacles.cell)
     for _ in range(cells):
         b = bucket(ix, iy, mask)
         for e in range(start[b], start[b + 1]):

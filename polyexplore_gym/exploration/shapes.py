@@ -25,9 +25,10 @@ def scan_polygon(exploration: ExplorationMap, index: int) -> shapely.Polygon:
     """The polygon of one scan, valid (noise may fold it at the end of a range discontinuity)."""
     import shapely
 
-    corners = exploration.points[index] + exploration.apexes[index]
-    if not exploration.full:
-        corners = np.concatenate((exploration.apexes[index][None], corners))
+    scans = exploration.scans
+    corners = scans.points[index] + scans.apexes[index]
+    if not scans.full:
+        corners = np.concatenate((scans.apexes[index][None], corners))
     return shapely.Polygon(corners).buffer(0)
 
 
@@ -57,7 +58,7 @@ def faithful_polygon(exploration: ExplorationMap, walls: np.ndarray, reach: floa
     """
     import shapely
 
-    reach = exploration.cover if reach is None else reach
+    reach = exploration.tol.cover if reach is None else reach
     area = exploration_polygon(exploration)
     if not len(walls):
         return area
@@ -79,7 +80,7 @@ def jump_edges(exploration: ExplorationMap) -> tuple[np.ndarray, ...]:
     """The jump edges as polylines (k, 2)."""
     lines = []
     for chain in exploration.chains.id:
-        pieces = exploration.pieces[exploration.owner == chain]
+        pieces = exploration.pieces.segments[exploration.pieces.owner == chain]
         points = [pieces[0, :2]]
         for piece in pieces:
             if math.hypot(*(piece[:2] - points[-1])) > 1e-9:

@@ -22,6 +22,9 @@ POCKET_AREA = 1.0
 """Largest pocket that the robot need not reach, m2; it must also be below `POCKET_SHARE`."""
 POCKET_SHARE = 0.01
 """Largest pocket that the robot need not reach, as a share of where it can stand."""
+PASSABLE = 1.02
+"""Passages are those for a disc so many times as large as the robot: paths keep 1.6 % of the radius off the walls
+(`exploration` plans them so), and the polygon that stands for a disc is up to 0.12 % too small."""
 # Segments per quarter circle of the disc: its polygon is at most 0.12 % smaller than the disc.
 _QUAD_SEGMENTS = 16
 _HASH_UNIT = 1e-6
@@ -66,6 +69,12 @@ class FloorPlan:
     ) -> FloorPlan:
         """A plan from rings in any of the accepted forms (nested sequences or arrays)."""
         return cls(name=name, exterior=exterior, holes=holes, meta=meta or {})  # type: ignore[arg-type]
+
+    def named(self, name: str, meta: Mapping[str, Any]) -> FloorPlan:
+        """The same geometry with another name and meta; it is not checked again."""
+        plan = object.__new__(FloorPlan)
+        plan.__setstate__((name, self.exterior, self.holes, copy.deepcopy(dict(meta))))
+        return plan
 
     def __getstate__(self) -> tuple[Any, ...]:
         return self.name, self.exterior, self.holes, dict(self.meta)
@@ -154,7 +163,7 @@ class FloorPlan:
         """The largest connected part of `free_space(radius)`, prepared; an empty polygon if there is none."""
         radius = _checked_radius(radius)
         if radius not in self._largest_parts:
-            parts = list(_polygons(self.free_space(radius)))
+            parts = list(polygons(self.free_space(radius)))
             part = max(parts, key=lambda p: p.area) if parts else shapely.Polygon()
             shapely.prepare(part)
             self._largest_parts[radius] = part
@@ -172,6 +181,13 @@ class FloorPlan:
         _, distance = self._wall_tree.query_nearest(shapely.points(points), return_distance=True, all_matches=False)
         inside = shapely.contains_xy(self.polygon, points[:, 0], points[:, 1])
         return np.where(inside, distance, -distance)
+
+    def covers(self, start: Any) -> bool:
+        """Whether the point x, y (m) lies in the plan; also True of what is no point, which `check_start` tells of."""
+        try:
+            return bool(shapely.intersects_xy(self.polygon, float(start[0]), float(start[1])))
+        except (TypeError, ValueError, IndexError, KeyError):
+            return True
 
     def sample_start(self, rng: np.random.Generator, radius: float, margin: float = 0.1) -> np.ndarray:
         """A random start pose (3,): x, y (m), heading (rad).
@@ -228,7 +244,7 @@ class FloorPlan:
         # 1 um for a start computed to touch.
         if clearance < radius - 1e-6:
             raise InvalidFloorPlanError(f"{where} has {clearance:.3f} m clearance; the robot's radius is {radius:g} m")
-        parts = list(_polygons(self.free_space(radius)))
+        parts = list(polygons(self.free_space(radius)))
         if len(parts) > 1:
             point = shapely.Point(values[:2])
             own = min(parts, key=lambda p: (p.distance(point), -p.area))
@@ -238,24 +254,29 @@ class FloorPlan:
                 )
 
     def check_connected(self, radius: float) -> None:
-        """Check that a disc of `radius` (m) reaches all of the free space but negligible pockets.
+        """Check that a robot of `radius` (m) reaches all of the free space but negligible pockets.
 
-        A pocket is negligible below `POCKET_AREA` and `POCKET_SHARE` of where the disc's centre may be.
+        A passage counts from `PASSABLE` times the robot's width. A pocket is negligible below `POCKET_AREA` and
+        `POCKET_SHARE` of where the disc's centre may be. `load_plan` trims larger ones, with a warning, when it is
+        given a radius.
 
         Raises:
             InvalidFloorPlanError: naming the narrow place.
         """
-        parts = sorted(_polygons(self.free_space(radius)), key=lambda p: -p.area)
+        parts = sorted(polygons(self.free_space(PASSABLE * radius)), key=lambda p: -p.area)
         if not parts:
-            raise InvalidFloorPlanError(f"{self.name}: no room for a robot of radius {radius:g} m")
-        limit = min(POCKET_AREA, POCKET_SHARE * sum(p.area for p in parts))
-        if len(parts) > 1 and parts[1].area >= limit:
+            x0, y0, x1, y1 = self.bounds
+            raise InvalidFloorPlanError(
+                f"{self.name}: no room for a robot of radius {radius:g} m in a plan of {x1 - x0:.3g} x {y1 - y0:.3g} m"
+            )
+        if pockets(parts):
             near, far = shapely.ops.nearest_points(parts[0], parts[1])
             x, y = (near.x + far.x) / 2, (near.y + far.y) / 2
             ring, vertex = self._nearest_vertex(x, y)
             raise InvalidFloorPlanError(
                 f"{self.name}: {ring}, vertex {vertex}: the free space is not connected for a robot of radius "
-                f"{radius:g} m; {parts[1].area:.2f} m2 are cut off at ({x:.2f}, {y:.2f})"
+                f"{radius:g} m; {parts[1].area:.2f} m2 are cut off at ({x:.2f}, {y:.2f}); load_plan with "
+                f"radius={radius:g} leaves them out"
             )
 
     def _nearest_vertex(self, x: float, y: float) -> tuple[str, int]:
@@ -268,13 +289,20 @@ class FloorPlan:
         raise AssertionError("unreachable")
 
 
+def pockets(parts: Sequence[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Of the parts of a disc's free space, largest first, those that are cut off and not negligible."""
+    limit = min(POCKET_AREA, POCKET_SHARE * sum(part.area for part in parts))
+    return [part for part in parts[1:] if part.area >= limit]
+
+
 def _checked_radius(radius: float) -> float:
     if not (math.isfinite(radius) and radius >= 0):
         raise ValueError(f"radius or margin {radius!r}: must be a finite number of metres, not negative")
     return float(radius)
 
 
-def _polygons(geometry: Any) -> Iterator[shapely.Polygon]:
+def polygons(geometry: Any) -> Iterator[shapely.Polygon]:
+    """The polygons of a geometry that are not empty."""
     for part in shapely.get_parts(geometry):
         if part.geom_type == "Polygon" and not part.is_empty:
             yield part

@@ -7,20 +7,25 @@ and the ring's direction.
 
 from __future__ import annotations
 
+import difflib
 import math
 import reprlib
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
 import shapely
 
-from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
+from polyexplore_gym.floorplan.units import FAR, guess
 
 MAX_VERTICES = 20_000
 """Most vertices of a plan, all rings together."""
-MAX_COORDINATE = 10_000.0
+MAX_COORDINATE = FAR
 """Largest absolute coordinate, m."""
+MAX_EXTENT = 1_000_000.0
+"""Largest bounding box, m2 (1 km2): its sample points for the share seen, 25 a square metre, take 1.4 GB."""
 MERGE_DISTANCE = 1e-6
 """Neighbouring vertices closer than this are one repeated vertex, m."""
 MIN_AREA = 1e-6
@@ -55,7 +60,9 @@ def normalise(exterior: Any, holes: Any) -> tuple[np.ndarray, tuple[np.ndarray, 
         total += _length(points, name)
         if total > MAX_VERTICES:
             fail(name, None, f"too many vertices: more than {MAX_VERTICES} in all")
-        ring, index = _without_repeats(_to_array(points, name), name)
+        array = to_array(points, name)
+        _check_limits(array, name)
+        ring, index = _without_repeats(array, name)
         _check_not_collinear(ring, index, name)
         rings.append(ring)
         indices.append(index)
@@ -80,6 +87,25 @@ def shorten(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def check_keys(data: Mapping[Any, Any], known: Sequence[str], where: str) -> None:
+    """What a file says and nobody reads: an error if it looks like a slip of the pen, else a warning.
+
+    Raises:
+        InvalidFloorPlanError: naming the key and the one that is meant.
+    """
+    others = []
+    for key in data:
+        if not isinstance(key, str) or key in known:
+            continue
+        near = difflib.get_close_matches(key.lower()[:60], known, n=1, cutoff=0.75)
+        if near and near[0] not in data:
+            raise InvalidFloorPlanError(f"{shorten(key)}: unknown key; is {near[0]!r} meant?")
+        others.append(key)
+    if others:
+        names = ", ".join(shorten(key) for key in others[:5]) + (", ..." if len(others) > 5 else "")
+        warnings.warn(f"{where}: not read: {names}; known: {', '.join(known)}", FloorPlanWarning, stacklevel=2)
+
+
 def signed_area(ring: np.ndarray) -> float:
     """Area of a ring (n, 2), m2; positive when counter-clockwise."""
     p = ring - ring[0]
@@ -95,8 +121,9 @@ def _length(points: Any, name: str) -> int:
     return len(points)
 
 
-def _to_array(points: Any, name: str) -> np.ndarray:
-    """(n, 2) finite coordinates within the limits, or an error naming the first bad vertex."""
+def to_array(points: Any, name: str) -> np.ndarray:
+    """(n, 2) finite coordinates, or an error naming the first bad vertex."""
+    _length(points, name)
     if not isinstance(points, np.ndarray):
         points = [_to_point(point, name, i) for i, point in enumerate(points)]
     ring = np.array(points, dtype=np.float64).reshape(-1, 2)
@@ -105,11 +132,24 @@ def _to_array(points: Any, name: str) -> np.ndarray:
         i = int(np.argmax(bad))
         value = "NaN" if np.isnan(ring[i]).any() else "infinite"
         fail(name, i, f"the coordinate is {value}")
+    return ring
+
+
+def _check_limits(ring: np.ndarray, name: str) -> None:
+    """No coordinate and no ring may be larger than a plan that can be held."""
     bad = (np.abs(ring) > MAX_COORDINATE).any(axis=1)
+    width, height = np.ptp(ring, axis=0).tolist() if len(ring) else (0.0, 0.0)
     if bad.any():
         i = int(np.argmax(bad))
-        fail(name, i, f"({ring[i, 0]:g}, {ring[i, 1]:g}) lies beyond {MAX_COORDINATE / 1000:g} km; units are metres")
-    return ring
+        where = f"({ring[i, 0]:g}, {ring[i, 1]:g}) lies beyond {MAX_COORDINATE / 1000:g} km"
+        fail(name, i, f"{where}; units are metres{guess(width, height)}")
+    if width * height > MAX_EXTENT:
+        fail(
+            name,
+            None,
+            f"spans {width:g} x {height:g} m, more than {MAX_EXTENT / 1e6:g} km2, which is too large to hold; units "
+            f"are metres{guess(width, height)}",
+        )
 
 
 def _to_point(point: Any, name: str, i: int) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from polyexplore_gym.mapping.grouping import UNDECIDED, attach, cut, fit_labels,
 from polyexplore_gym.mapping.hough import hough_labels
 
 COLLINEAR_GATE = 9.21  # chi-square, 2 degrees of freedom, 99 %
-LEAST_RANGE_NOISE = 1e-3  # m; a noise-free sensor is fitted with these, so that weights stay finite
+LEAST_RANGE_NOISE = 2e-3  # of a door's width; a noise-free sensor is fitted with these, so that weights stay finite
 LEAST_ANGLE_NOISE = 1e-4  # rad
 LEAST_RANGE = 1e-6  # m; the square of a much smaller one would be 0
 
@@ -53,8 +53,8 @@ def extract_lines(
     """Fit lines with covariances to one scan.
 
     A first guess (`config.start`) labels the returns; weighted fits, grouping of collinear lines,
-    attachment of free returns within 3 sigma and cutting at doorways follow. See DESIGN section 4
-    for the equations and their sources.
+    attachment of free returns within 3 sigma and cutting at doorways follow. The equations and
+    their sources stand in `fit` and `grouping`.
 
     Args:
         angles: (n,) nominal beam angles in the robot frame, rad, in any order; the lines do not depend on it.
@@ -77,9 +77,11 @@ def extract_lines(
         (array([2.]), array([0.]), (1, 4))
     """
     sensor = SensorConfig() if sensor is None else sensor
-    config = MappingConfig() if config is None else config
+    config = (MappingConfig() if config is None else config).resolved()
+    assert config.door_width is not None
+    assert config.min_length is not None
     known, angles, ranges = check_scan(angles, ranges)
-    sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE)
+    sigma_range = max(sensor.sigma_range, config.range_floor, LEAST_RANGE_NOISE * config.door_width)
     sigma_angle = max(sensor.sigma_angle, LEAST_ANGLE_NOISE)
     start, points = turned_returns(angles, ranges, sensor.max_range, sensor.full_circle)
     resolution = _resolution(angles, known) if angles.size > 1 else sensor.resolution
@@ -284,7 +286,7 @@ def _assemble(
         x, y, beam, ranges, cos_t, sin_t, max_range, resolution, label, fits,
         sigma_range, sigma_angle, reach, min_points, min_length,
     )  # fmt: skip
-    fragments = fragment_chains(x, y, beam, where, resolution, fits, var_range, var_angle)
+    fragments = fragment_chains(x, y, beam, where, resolution, fits, var_range, var_angle, reach)
 
     number = np.full(count, -1, np.int64)
     lines = 0

@@ -11,28 +11,31 @@ from polyexplore_gym.mapping.fit import normal_variance
 from polyexplore_gym.mapping.grouping import ATTACH
 
 OBLIQUE = 1.0 / math.cos(math.radians(70.0))  # neighbouring leftover returns are joined up to this incidence
-COARSEST = 0.2  # largest simplification tolerance, m
-LEAST = 0.01  # least length of a piece, m
+# Shares of a door's width:
+COARSEST = 0.4  # largest simplification tolerance
+LEAST = 0.02  # least length of a piece
+WIDEST = 0.2  # greatest length of the piece about a lone return: what lies between far beams is not known
 
 
 @njit(cache=True)
-def lone(x: float, y: float, resolution: float, out: np.ndarray, count: int) -> int:
+def lone(x: float, y: float, resolution: float, door: float, out: np.ndarray, count: int) -> int:
     """Append a piece about the return (x, y), across its beam and as wide, to out. Returns the new count."""
-    half = 0.5 * max(resolution, LEAST / math.hypot(x, y))
+    half = 0.5 * min(max(resolution, LEAST * door / math.hypot(x, y)), WIDEST * door / math.hypot(x, y))
     out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x + half * y, y - half * x, x - half * y, y + half * x
     return count + 1
 
 
 @njit(cache=True)
 def beside(
-    x: float, y: float, resolution: float, fits: np.ndarray, var_range: float, var_angle: float, out: np.ndarray,
-    count: int,
+    x: float, y: float, resolution: float, fits: np.ndarray, var_range: float, var_angle: float, door: float,
+    out: np.ndarray, count: int,
 ) -> int:  # fmt: skip
     """As `lone`, but along the line on which the return lies, if there is one that the piece would stick out of.
 
     On a line means within 3 sigma, and out of it farther than that: a wide piece, far off on an oblique wall.
     """
-    best, least, half = -1, ATTACH, 0.5 * max(resolution, LEAST / math.hypot(x, y))
+    d = math.hypot(x, y)
+    best, least, half = -1, ATTACH, 0.5 * min(max(resolution, LEAST * door / d), WIDEST * door / d)
     for i in range(fits.shape[0]):
         if fits[i, 8] == 0:
             continue
@@ -42,8 +45,8 @@ def beside(
         if e * e < least * variance and out_of * out_of > ATTACH * variance:
             best, least = i, e * e / variance
     if best < 0:
-        return lone(x, y, resolution, out, count)
-    half *= math.hypot(x, y)
+        return lone(x, y, resolution, door, out, count)
+    half *= d
     ux, uy = -half * math.sin(fits[best, 1]), half * math.cos(fits[best, 1])
     out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x - ux, y - uy, x + ux, y + uy
     return count + 1
@@ -51,7 +54,15 @@ def beside(
 
 @njit(cache=True)
 def simplify(
-    x: np.ndarray, y: np.ndarray, lo: int, hi: int, var_range: float, var_angle: float, out: np.ndarray, count: int
+    x: np.ndarray,
+    y: np.ndarray,
+    lo: int,
+    hi: int,
+    var_range: float,
+    var_angle: float,
+    door: float,
+    out: np.ndarray,
+    count: int,
 ) -> int:
     """Append the pieces of the chain lo..hi to out, simplified (Douglas-Peucker) to 3 sigma. Returns the new count."""
     stack = [(lo, hi)]
@@ -64,14 +75,14 @@ def simplify(
             dx, dy = x[k] - x[a], y[k] - y[a]
             t = 0.0 if length == 0.0 else min(max((dx * ux + dy * uy) / (length * length), 0.0), 1.0)
             off = math.hypot(dx - t * ux, dy - t * uy)
-            tolerance = min(3.0 * math.sqrt(var_range + var_angle * (x[k] * x[k] + y[k] * y[k])), COARSEST)
+            tolerance = min(3.0 * math.sqrt(var_range + var_angle * (x[k] * x[k] + y[k] * y[k])), COARSEST * door)
             if off / tolerance > far:
                 best, far = k, off / tolerance
         if best >= 0:
             stack.append((best, b))
             stack.append((a, best))
-        elif length < LEAST:  # very near the robot
-            count = lone(x[a], y[a], 0.0, out, count)
+        elif length < LEAST * door:  # very near the robot
+            count = lone(x[a], y[a], 0.0, door, out, count)
         else:
             out[count, 0], out[count, 1], out[count, 2], out[count, 3] = x[a], y[a], x[b], y[b]
             count += 1
@@ -88,8 +99,10 @@ def fragment_chains(
     fits: np.ndarray,
     var_range: float,
     var_angle: float,
+    door: float,
 ) -> np.ndarray:
-    """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width.
+    """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width, `WIDEST` at
+    most. Returns a door's width apart are not joined.
 
     fits: (count, 9) of `grouping.fit_labels`. What lies on one of these lines, where returns are too far apart to be
     its wall, gives a piece along it.
@@ -106,12 +119,12 @@ def fragment_chains(
         stop = k
         while stop + 1 < m and where[stop + 1] < 0 and beam[stop + 1] == beam[stop] + 1:
             d = min(math.hypot(x[stop], y[stop]), math.hypot(x[stop + 1], y[stop + 1]))
-            if math.hypot(x[stop + 1] - x[stop], y[stop + 1] - y[stop]) > OBLIQUE * resolution * d + noise:
+            if math.hypot(x[stop + 1] - x[stop], y[stop + 1] - y[stop]) > min(OBLIQUE * resolution * d + noise, door):
                 break
             stop += 1
         if stop == k:
-            count = beside(x[k], y[k], resolution, fits, var_range, var_angle, out, count)
+            count = beside(x[k], y[k], resolution, fits, var_range, var_angle, door, out, count)
         else:
-            count = simplify(x, y, k, stop, var_range, var_angle, out, count)
+            count = simplify(x, y, k, stop, var_range, var_angle, door, out, count)
         k = stop + 1
     return out[:count].copy()

@@ -137,7 +137,7 @@ def attach(
                     if last[i] == math.inf:
                         continue
                     e = x[k] * ca[i] + y[k] * sa[i] - fits[i, 0]
-                    if abs(e) > 1.0:
+                    if abs(e) > 2.0 * reach:
                         continue
                     t = y[k] * ca[i] - x[k] * sa[i]
                     z2 = e * e / normal_variance(x[k], y[k], ca[i], sa[i], var_range, var_angle)

@@ -15,10 +15,11 @@ from numba import njit
 
 from polyexplore_gym.mapping.fit import fit, normal_variance, wrap
 
-RASTER = 0.025  # m a pixel
+RASTER = 0.05  # a pixel, of a door's width
 ANGLE_STEP = math.radians(1.0)
 VOTES = 5
-LEAST_LENGTH = 0.25  # m, of a line on the raster
+LEAST_LENGTH = 0.5  # of a line on the raster, of a door's width
+MOST_PIXELS = 4096  # on a side, for memory
 ROUNDS = 4  # searches of a scan, each on what is left
 NEAR = 3.0**2
 PARALLEL = math.radians(15.0)  # a line this near in direction and overlapping is impossible beside a dominant one
@@ -45,8 +46,9 @@ def hough_labels(
     if x.size < min_points:
         return label, 0
     x0, y0 = float(x.min()), float(y.min())
-    column = ((x - x0) / RASTER).astype(np.int64)
-    row = ((y - y0) / RASTER).astype(np.int64)
+    pixel = max(RASTER * reach, (float(x.max()) - x0) / MOST_PIXELS, (float(y.max()) - y0) / MOST_PIXELS)
+    column = ((x - x0) / pixel).astype(np.int64)
+    row = ((y - y0) / pixel).astype(np.int64)
     image = np.zeros((int(row.max()) + 1, int(column.max()) + 1), np.uint8)
     for _ in range(ROUNDS):
         free = label < 0
@@ -54,14 +56,16 @@ def hough_labels(
             break
         image[:] = 0
         image[row[free], column[free]] = 255
-        found = HoughLinesP(image, 1, ANGLE_STEP, VOTES, minLineLength=LEAST_LENGTH / RASTER, maxLineGap=reach / RASTER)
+        found = HoughLinesP(
+            image, 1, ANGLE_STEP, VOTES, minLineLength=LEAST_LENGTH * reach / pixel, maxLineGap=reach / pixel
+        )
         if found is None:
             break
-        ends = (found.reshape(-1, 4) + 0.5) * RASTER + np.array([x0, y0, x0, y0])
+        ends = (found.reshape(-1, 4) + 0.5) * pixel + np.array([x0, y0, x0, y0])
         if not grouping:
-            return label, take_each(x, y, ends, label, min_points)
+            return label, take_each(x, y, ends, label, min_points, pixel)
         before = count
-        count = take_dominant(x, y, ends, label, count, var_range, var_angle, min_points, min_length, reach)
+        count = take_dominant(x, y, ends, label, count, var_range, var_angle, min_points, min_length, reach, pixel)
         if count == before:
             break
     settle(x, y, label, count, var_range, var_angle, reach)
@@ -70,7 +74,13 @@ def hough_labels(
 
 @njit(cache=True)
 def beside(
-    x: np.ndarray, y: np.ndarray, label: np.ndarray, end: np.ndarray, var_range: float, var_angle: float
+    x: np.ndarray,
+    y: np.ndarray,
+    label: np.ndarray,
+    end: np.ndarray,
+    var_range: float,
+    var_angle: float,
+    pixel: float,
 ) -> np.ndarray:
     """Free returns within 3 sigma and a pixel of the segment `end`."""
     dx, dy = end[2] - end[0], end[3] - end[1]
@@ -84,20 +94,20 @@ def beside(
         px, py = x[k] - end[0], y[k] - end[1]
         t = (px * dx + py * dy) / length
         off = abs(px * ca + py * sa)
-        if -RASTER <= t <= length + RASTER:
+        if -pixel <= t <= length + pixel:
             spread = NEAR * normal_variance(x[k], y[k], ca, sa, var_range, var_angle)
-            if off <= RASTER + math.sqrt(spread):
+            if off <= pixel + math.sqrt(spread):
                 out[n] = k
                 n += 1
     return out[:n]
 
 
 @njit(cache=True)
-def take_each(x: np.ndarray, y: np.ndarray, ends: np.ndarray, label: np.ndarray, min_points: int) -> int:
+def take_each(x: np.ndarray, y: np.ndarray, ends: np.ndarray, label: np.ndarray, min_points: int, pixel: float) -> int:
     """Label the free returns within a pixel of each line, in the order found; returns the number of labels."""
     count = 0
     for i in range(ends.shape[0]):
-        index = beside(x, y, label, ends[i], 0.0, 0.0)
+        index = beside(x, y, label, ends[i], 0.0, 0.0, pixel)
         if index.size >= min_points:
             label[index] = count
             count += 1
@@ -116,17 +126,18 @@ def take_dominant(
     min_points: int,
     min_length: float,
     reach: float,
+    pixel: float,
 ) -> int:
     """Label the returns of the lines, the dominant line first; returns the new number of labels."""
     lines = ends.shape[0]
     votes = np.empty(lines, np.int64)
     for i in range(lines):
-        votes[i] = beside(x, y, label, ends[i], var_range, var_angle).size
+        votes[i] = beside(x, y, label, ends[i], var_range, var_angle, pixel).size
     while True:
         i = int(np.argmax(votes)) if lines > 0 else -1
         if i < 0 or votes[i] < min_points:
             return count
-        index = beside(x, y, label, ends[i], var_range, var_angle)
+        index = beside(x, y, label, ends[i], var_range, var_angle, pixel)
         votes[i] = 0
         if index.size < min_points:
             continue
@@ -149,14 +160,14 @@ def take_dominant(
                 mx, my = 0.5 * (ends[j, 0] + ends[j, 2]), 0.5 * (ends[j, 1] + ends[j, 3])
                 spread = NEAR * normal_variance(mx, my, ca, sa, var_range, var_angle)
                 off = abs(mx * ca + my * sa - rho)
-                if off <= RASTER + math.sqrt(spread) and max(a, b) > low - reach and min(a, b) < high + reach:
+                if off <= pixel + math.sqrt(spread) and max(a, b) > low - reach and min(a, b) < high + reach:
                     low, high = min(low, a, b), max(high, a, b)
             index = np.empty(x.size, np.int64)
             n = 0
             for k in range(x.size):
                 t = y[k] * ca - x[k] * sa
                 e = x[k] * ca + y[k] * sa - rho
-                if label[k] >= 0 or not low - RASTER <= t <= high + RASTER:
+                if label[k] >= 0 or not low - pixel <= t <= high + pixel:
                     continue
                 if e * e <= NEAR * normal_variance(x[k], y[k], ca, sa, var_range, var_angle):
                     index[n] = k
@@ -172,7 +183,7 @@ def take_dominant(
         count += 1
         for j in range(lines):
             if votes[j] > 0:
-                votes[j] = beside(x, y, label, ends[j], var_range, var_angle).size
+                votes[j] = beside(x, y, label, ends[j], var_range, var_angle, pixel).size
 
 
 @njit(cache=True)

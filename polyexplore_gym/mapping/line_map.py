@@ -20,7 +20,7 @@ class LineMap:
 
     Lines merge across scans if they were seen from the same side, overlap (or leave a gap below
     `config.door_width`) and pass dL' (P1 + P2)^-1 dL < `config.merge_gate` in a frame at the
-    middle of the pair (DESIGN section 5). The two faces of a thin wall never merge.
+    middle of the pair. The two faces of a thin wall never merge.
 
     Example:
         >>> import numpy as np
@@ -36,9 +36,11 @@ class LineMap:
     """
 
     def __init__(self, config: MappingConfig | None = None, sensor: SensorConfig | None = None) -> None:
-        self.config = MappingConfig() if config is None else config
+        self.config = (MappingConfig() if config is None else config).resolved()
+        assert self.config.door_width is not None
+        self._door = self.config.door_width
         self.sensor = SensorConfig() if sensor is None else sensor
-        self._var_range = max(self.sensor.sigma_range, self.config.range_floor, LEAST_RANGE_NOISE) ** 2
+        self._var_range = max(self.sensor.sigma_range, self.config.range_floor, LEAST_RANGE_NOISE * self._door) ** 2
         self._var_angle = max(self.sensor.sigma_angle, LEAST_ANGLE_NOISE) ** 2
         self._row_count = self._line_count = 0
         self._rows, self._lines = _rows(256), _lines(128)
@@ -61,7 +63,7 @@ class LineMap:
             covariance: (3, 3) covariance of the pose, m2, m rad, rad2.
 
         Returns:
-            Rows added, changed (an end moved by 2 mm or more) or removed, ascending.
+            Rows added, changed (an end moved by 0.4 % of a door's width or more) or removed, ascending.
 
         Raises:
             ValueError: pose or covariance has the wrong shape or is not finite.
@@ -76,7 +78,7 @@ class LineMap:
         slots = self._slots
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
-            pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self.config.door_width,
+            pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
             self.config.grouping, self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
         touched = np.sort(slots.touched[: slots.counts[3]])

@@ -17,7 +17,7 @@ used, so that nothing need be inflated. What is given up: a loop that closes doe
   S = T Hp' + (U)_line Hl' + R, K = T' S^-1, pose <- pose + K innovation, P <- P - K T, C <- C - K U. L stays. The
   scan line's own error v becomes one with the pose's: E[e_p v'] = V <- (I - K Hp) V for earlier lines, -K R for this.
 - Fused: the map moves line j by a gain G towards the scan line as seen from the corrected pose, whose error is
-  Kg e_p - H v (DESIGN section 5): e_j <- (I - G) e_j + G (Kg e_p - H v). G need not be told: the map's covariance went
+  Kg e_p - H v (see `fit.to_map`): e_j <- (I - G) e_j + G (Kg e_p - H v). G need not be told: the map's covariance went
   from Pj to Pj+ = (I - G) Pj, so I - G = Pj+ Pj^-1, and where no match tells R, G (H R H') G' = Pj+ G' - G Kg Pg Kg' G'
   with the Pg that it was given.
 - New: e_j = Kg e_p - H v.

@@ -28,10 +28,12 @@ from polyexplore_gym.mapping.slots import (
 
 MAX_TURN = 0.5  # rad; lines that differ more in direction are not compared
 STANDS_FOR = 0.5  # rad; a segment facing farther away does not stand for another: short walls at corners stay
-COVER = 0.04  # m; what lies within this + 3 sigma of a known segment is known
-BRIDGE = 0.1  # m; pieces of one line are joined across this + 3 sigma, at most half a door's width
-LEAST_PIECE = 0.01  # m; shorter pieces on a line are widened to this
-LEAST_END = 5e-3  # m; smallest standard deviation kept for a segment's end along its line
+# Shares of a door's width:
+COVER = 0.08  # what lies within this + 3 sigma of a known segment is known
+BRIDGE = 0.2  # pieces of one line are joined across this + 3 sigma, at most half a door
+LEAST_PIECE = 0.02  # shorter pieces on a line are widened to this
+LEAST_END = 0.01  # smallest standard deviation kept for a segment's end along its line
+CLOSE_LOOK = 0.1  # how densely it is looked at what of a segment is known
 
 
 @njit(cache=True)
@@ -138,14 +140,14 @@ def candidates(
 
 
 @njit(cache=True)
-def fused_end(old: float, v_old: float, new: float, v_new: float, outward: float) -> tuple[float, float]:
+def fused_end(old: float, v_old: float, new: float, v_new: float, outward: float, door: float) -> tuple[float, float]:
     """End of a segment from two sightings: their mean where they agree, else the outer one.
 
     The mere maximum would grow by noise with every scan and close doorways.
     """
     if (new - old) ** 2 <= 9.0 * (v_old + v_new):
         v = v_old * v_new / (v_old + v_new)
-        return (old * v_new + new * v_old) / (v_old + v_new), max(v, LEAST_END**2)
+        return (old * v_new + new * v_old) / (v_old + v_new), max(v, (LEAST_END * door) ** 2)
     if (new - old) * outward > 0.0:
         return new, v_new
     return old, v_old
@@ -194,13 +196,15 @@ def lay(
                     continue
                 gap = max(span[q, 0] - high, low - span[q, 1])
                 v = span[q, 2] + v_high if span[q, 0] > high else span[q, 3] + v_low
-                if gap <= min(BRIDGE + 3.0 * math.sqrt(v), 0.5 * door) and (best < 0 or span[q, 0] < span[best, 0]):
+                if gap <= min(BRIDGE * door + 3.0 * math.sqrt(v), 0.5 * door) and (
+                    best < 0 or span[q, 0] < span[best, 0]
+                ):
                     best = q
             if best >= 0:
                 met = True
                 least, most = min(low, span[best, 0]), max(high, span[best, 1])
-                low, v_low = fused_end(span[best, 0], span[best, 2], low, v_low, -1.0)
-                high, v_high = fused_end(span[best, 1], span[best, 3], high, v_high, 1.0)
+                low, v_low = fused_end(span[best, 0], span[best, 2], low, v_low, -1.0, door)
+                high, v_high = fused_end(span[best, 1], span[best, 3], high, v_high, 1.0, door)
                 if high <= low:  # apart, and their ends known so differently that the means cross
                     low, high = least, most
                 if span[best, 4] >= 0:
@@ -226,19 +230,20 @@ def lay(
         rows.next[row] = lines.first[line]
         lines.first[line] = row
         low, high = span[q, 0], span[q, 1]
-        if high - low < LEAST_PIECE:
-            low, high = 0.5 * (low + high - LEAST_PIECE), 0.5 * (low + high + LEAST_PIECE)
+        short = LEAST_PIECE * door - (high - low)
+        if short > 0.0:
+            low, high = low - 0.5 * short, high + 0.5 * short
         e = rows.ends[row]
         e[0], e[1] = rho * ca - low * sa, rho * sa + low * ca
         e[2], e[3] = rho * ca - high * sa, rho * sa + high * ca
         rows.end_variance[row, 0], rows.end_variance[row, 1] = span[q, 2], span[q, 3]
         rows.sigma[row] = across(alpha, p, e)
-        publish(rows, grid, slots, row)
+        publish(rows, grid, slots, row, door)
 
 
 @njit(cache=True)
 def clear_covered(
-    line: int, rows: Rows, lines: Lines, grid: Grid, slots: Slots, sigma_range: float, found: np.ndarray
+    line: int, rows: Rows, lines: Lines, grid: Grid, slots: Slots, sigma_range: float, door: float, found: np.ndarray
 ) -> None:
     """Remove fragments, and shorter segments that face the same way, that the line's changed rows cover."""
     alpha = facing(lines, line)
@@ -247,16 +252,16 @@ def clear_covered(
         w = rows.segments[row]
         fresh = rows.touched[row] == slots.counts[2]
         length = math.hypot(w[2] - w[0], w[3] - w[1])
-        for q in range(box_query(grid, w, 0.5, found) if fresh else 0):
+        for q in range(box_query(grid, w, door, found) if fresh else 0):
             f = found[q]
             g = rows.segments[f]
-            tolerance = COVER + 3.0 * rows.sigma[f]
+            tolerance = COVER * door + 3.0 * rows.sigma[f]
             if rows.line[f] >= 0:
                 if rows.line[f] == line or math.hypot(g[2] - g[0], g[3] - g[1]) > length:
                     continue
                 if abs(wrap(alpha - facing(lines, rows.line[f]))) > STANDS_FOR:
                     continue
-                tolerance = COVER + sigma_range + 3.0 * math.hypot(rows.sigma[f], rows.sigma[row])
+                tolerance = COVER * door + sigma_range + 3.0 * math.hypot(rows.sigma[f], rows.sigma[row])
             if within(g[0], g[1], w, tolerance) and within(g[2], g[3], w, tolerance):
                 if rows.line[f] >= 0:
                     unlink(rows, lines, slots, f)
@@ -267,17 +272,17 @@ def clear_covered(
 @njit(cache=True)
 def covered(
     s: np.ndarray, sigma: float, side_alpha: float, any_side: bool, rows: Rows, lines: Lines, grid: Grid, stamp: int,
-    sigma_range: float, found: np.ndarray,
+    sigma_range: float, door: float, found: np.ndarray,
 ) -> tuple[float, float]:  # fmt: skip
-    """The part of segment s not within 4 cm + 3 sigma of known segments, from share a to share b; a >= b if none.
+    """The part of segment s not within `COVER` + 3 sigma of known segments, from share a to share b; a >= b if none.
 
-    It is looked at every 5 cm or less; a part seen at one place only reaches half way to the next.
+    It is looked at every tenth of a door or less; a part seen at one place only reaches half way to the next.
     Rows touched first in insert `stamp` that are fragments do not count: they come from the same scan.
     With any_side False only rows that face the same way (normal direction side_alpha) count.
     """
-    tolerance = COVER + 3.0 * sigma
+    tolerance = COVER * door + 3.0 * sigma
     n = 0
-    for q in range(box_query(grid, s, tolerance + 0.5, found)):
+    for q in range(box_query(grid, s, tolerance + door, found)):
         row = found[q]
         j = rows.line[row]
         if any_side:
@@ -288,7 +293,7 @@ def covered(
             found[n] = row
             n += 1
     length = math.hypot(s[2] - s[0], s[3] - s[1])
-    steps = max(1, math.ceil(length / 0.05))
+    steps = max(1, math.ceil(length / (CLOSE_LOOK * door)))
     first, last = 2.0, -1.0
     for i in range(steps + 1):
         t = i / steps
@@ -296,7 +301,7 @@ def covered(
         hit = False
         for q in range(n):
             row = found[q]
-            reach = tolerance if any_side else COVER + sigma_range + 3.0 * math.hypot(sigma, rows.sigma[row])
+            reach = tolerance if any_side else COVER * door + sigma_range + 3.0 * math.hypot(sigma, rows.sigma[row])
             if within(px, py, rows.segments[row], reach):
                 hit = True
                 break
@@ -373,7 +378,7 @@ def insert(
             dc, psi = x * ca + y * sa, x * sa - y * ca
             v_normal = var_range * dc * dc / d2 + var_angle * psi * psi
             v = var_range * var_angle * d2 / v_normal + var_xy + pose_covariance[2, 2] * d2
-            placed[k, 4 + e] = max(v, LEAST_END**2)
+            placed[k, 4 + e] = max(v, (LEAST_END * door) ** 2)
 
     # Lines of one scan share its pose error: those that meet one map line merge in the scan's own frame; of those that
     # the scan tells apart the nearest has it, the others take the next that they pass with.
@@ -440,7 +445,7 @@ def insert(
             if target < 0:
                 # a wall known already, but not within the gate: only what is new of it
                 sigma = across(a0, p0, placed[k])
-                a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, sigma_range, found)
+                a, b = covered(placed[k, :4], sigma, a0, False, rows, lines, grid, stamp, sigma_range, door, found)
                 if a >= b:
                     continue
                 clip(fresh[m], a, b)
@@ -461,7 +466,7 @@ def insert(
             lines.born[target] = stamp
         store(lines, target, r0, a0, p0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
-        clear_covered(target, rows, lines, grid, slots, sigma_range, found)
+        clear_covered(target, rows, lines, grid, slots, sigma_range, door, found)
 
     piece = np.empty(4)
     for k in range(fragments.shape[0]):
@@ -471,7 +476,7 @@ def insert(
             piece[2 * e], piece[2 * e + 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
             d2 = max(d2, x * x + y * y)
         sigma = math.sqrt(var_range + var_xy + (var_angle + pose_covariance[2, 2]) * d2)
-        a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, sigma_range, found)
+        a, b = covered(piece, sigma, 0.0, True, rows, lines, grid, stamp, sigma_range, door, found)
         if a >= b:
             continue
         row = new_row(rows, slots)
@@ -479,4 +484,4 @@ def insert(
         clip(piece, a, b)
         rows.ends[row] = piece
         rows.end_variance[row] = sigma * sigma
-        publish(rows, grid, slots, row)
+        publish(rows, grid, slots, row, door)

@@ -12,7 +12,7 @@ from polyexplore_gym.mapping.fit import wrap
 from polyexplore_gym.mapping.grid import Grid, grid_put, grid_remove
 
 MEMORY = 16  # inserts that a line remembers
-STILL = 2e-3  # m; a row whose ends move less counts as untouched
+STILL = 0.004  # of a door's width; a row whose ends move less counts as untouched
 
 
 class Rows(NamedTuple):
@@ -21,7 +21,7 @@ class Rows(NamedTuple):
     segments: np.ndarray
     """(M, 4) as published: end points, free space seen on the left."""
     ends: np.ndarray
-    """(M, 4) the same to the last bit; `segments` follows in steps of 2 mm or more."""
+    """(M, 4) the same to the last bit; `segments` follows in steps of `STILL` or more."""
     end_variance: np.ndarray
     """(M, 2) variance of each end along the line, m2."""
     alive: np.ndarray
@@ -142,11 +142,11 @@ def free_line(lines: Lines, slots: Slots, line: int) -> None:
 
 
 @njit(cache=True)
-def publish(rows: Rows, grid: Grid, slots: Slots, row: int) -> None:
-    """Bring the published segment up to date if an end moved by 2 mm or more."""
+def publish(rows: Rows, grid: Grid, slots: Slots, row: int, door: float) -> None:
+    """Bring the published segment up to date if an end moved by `STILL` or more."""
     e, s = rows.ends[row], rows.segments[row]
-    still = math.hypot(e[0] - s[0], e[1] - s[1]) < STILL and math.hypot(e[2] - s[2], e[3] - s[3]) < STILL
-    if not still:
+    least = STILL * door
+    if not (math.hypot(e[0] - s[0], e[1] - s[1]) < least and math.hypot(e[2] - s[2], e[3] - s[3]) < least):
         rows.segments[row] = e
         grid_put(grid, row, e[0], e[1], e[2], e[3])
         touch(rows, slots, row)

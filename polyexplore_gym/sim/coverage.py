@@ -18,11 +18,23 @@ from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.errors import InvalidMotionError
 from polyexplore_gym.sim.laser import ON_LINE, out_of_reach, strike
 
-_CELL = 1.0
+MOST_POINTS = 2_000_000
+"""Sample points of a plan, at most: 50 MB, and a fifth of a second at the start of an episode."""
+_A_CELL = 25
+"""Points in a cell of the look-up grid, in the mean."""
 _BINS = 1024
 _RANGE_TOLERANCE = 1e-9
 _DEPTH_TOLERANCE = 1e-9
 """A wall hides a point only if it is nearer by this share of the distance."""
+
+
+def grid_spacing(radius: float, area: float) -> float:
+    """Spacing (m) of the sample points for a robot of this radius (m) in a free area (m2).
+
+    0.8 radii: whatever lets the robot in then holds points, two or three in a row across its body, and
+    what it can do nothing with hardly counts. Wider where a plan would get more than `MOST_POINTS`.
+    """
+    return max(0.8 * radius, math.sqrt(area / MOST_POINTS))
 
 
 @njit(cache=True, inline="always")
@@ -98,12 +110,12 @@ def _hide_edge_on(sx, sy, nearest, ax, ay, bx, by):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _bucket(x, y, x0, y0, columns, rows):  # type: ignore[no-untyped-def]
+def _bucket(x, y, x0, y0, size, columns, rows):  # type: ignore[no-untyped-def]
     """Points by grid cell: order (n,) and the start of each cell in it (cells + 1,)."""
     n = x.size
     cell, starts = np.empty(n, np.int64), np.zeros(columns * rows + 1, np.int64)
     for i in range(n):
-        cell[i] = int((y[i] - y0) / _CELL) * columns + int((x[i] - x0) / _CELL)
+        cell[i] = int((y[i] - y0) / size) * columns + int((x[i] - x0) / size)
         starts[cell[i] + 1] += 1
     for k in range(columns * rows):
         starts[k + 1] += starts[k]
@@ -115,14 +127,14 @@ def _bucket(x, y, x0, y0, columns, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, columns, x0, y0, seen):  # type: ignore[no-untyped-def]
+def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, size, columns, x0, y0, seen):  # type: ignore[no-untyped-def]
     """Mark the points seen from pose; the unseen ones of a cell stand first in it. Returns how many are new."""
     rows = unseen.size // columns
     x, y = pose[0], pose[1]
     hx, hy, least = math.cos(pose[2]), math.sin(pose[2]), math.cos(half_view) - 1e-12
     reach = max_range + _RANGE_TOLERANCE
-    c0, c1 = max(0, math.floor((x - reach - x0) / _CELL)), min(columns - 1, math.floor((x + reach - x0) / _CELL))
-    r0, r1 = max(0, math.floor((y - reach - y0) / _CELL)), min(rows - 1, math.floor((y + reach - y0) / _CELL))
+    c0, c1 = max(0, math.floor((x - reach - x0) / size)), min(columns - 1, math.floor((x + reach - x0) / size))
+    r0, r1 = max(0, math.floor((y - reach - y0) / size)), min(rows - 1, math.floor((y + reach - y0) / size))
     count = 0
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
@@ -132,8 +144,8 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
     for r in range(r0, r1 + 1):
         for c in range(c0, c1 + 1):
             cell = r * columns + c
-            mx, my = x0 + (c + 0.5) * _CELL - x, y0 + (r + 0.5) * _CELL - y
-            if math.hypot(mx, my) > reach + _CELL or (half_view <= 0.5 * math.pi and mx * hx + my * hy < -_CELL):
+            mx, my = x0 + (c + 0.5) * size - x, y0 + (r + 0.5) * size - y
+            if math.hypot(mx, my) > reach + size or (half_view <= 0.5 * math.pi and mx * hx + my * hy < -size):
                 continue  # the whole cell is out of range, or behind
             for j in range(starts[cell], starts[cell] + unseen[cell]):
                 ux, uy = px[j] - x, py[j] - y
@@ -147,7 +159,7 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
         if not shown[i]:
             continue
         j = slots[i]
-        cell = int((py[j] - y0) / _CELL) * columns + int((px[j] - x0) / _CELL)
+        cell = int((py[j] - y0) / size) * columns + int((px[j] - x0) / size)
         last = starts[cell] + unseen[cell] - 1
         unseen[cell] -= 1
         seen[order[j]] = True
@@ -158,46 +170,156 @@ def _mark(segments, pose, max_range, half_view, px, py, order, starts, unseen, c
     return new
 
 
+@njit(cache=True, inline="always")
+def _at(index, origin, spacing):  # type: ignore[no-untyped-def]
+    return origin + (index + 0.5) * spacing
+
+
+@njit(cache=True)
+def _first_at(value, origin, spacing, count):  # type: ignore[no-untyped-def]
+    """The first index of a row of points, 0 to count, that lies at `value` or beyond."""
+    i = min(max(math.ceil((value - origin) / spacing - 0.5), 0), count)
+    while i > 0 and _at(i - 1, origin, spacing) >= value:
+        i -= 1
+    while i < count and _at(i, origin, spacing) < value:
+        i += 1
+    return i
+
+
+@njit(cache=True)
+def _crossings(segments, spacing, x0, y0, columns, rows):  # type: ignore[no-untyped-def]
+    """Where walls cross the rows of the grid, and the points on walls: numbers row * (columns + 1) + column, sorted.
+
+    A crossing's column is that of the first point strictly to its right. As many crossings lie to the left of a
+    point that is on no wall as on any other way out, if a wall owns its lower end only.
+    """
+    most = 0
+    for k in range(segments.shape[0]):
+        ax, ay, bx, by = segments[k]
+        most += int(abs(by - ay) / spacing) + 3
+        most += int(abs(bx - ax) / spacing) + 3 if ay == by else 0
+    crossed, on = np.empty(most, np.int64), np.empty(most, np.int64)
+    m = n = 0
+    for k in range(segments.shape[0]):
+        ax, ay, bx, by = segments[k]
+        if by < ay:
+            ax, ay, bx, by = bx, by, ax, ay
+        for r in range(_first_at(ay, y0, spacing, rows), rows):
+            y = _at(r, y0, spacing)
+            if y > by:
+                break
+            row = r * (columns + 1)
+            if ay == by:
+                for c in range(_first_at(min(ax, bx), x0, spacing, columns), columns):
+                    if _at(c, x0, spacing) > max(ax, bx):
+                        break
+                    on[n] = row + c
+                    n += 1
+                continue
+            c = _first_at(ax + (y - ay) / (by - ay) * (bx - ax), x0, spacing, columns)  # but for rounding
+            while c > 0 and side(ax, ay, bx, by, _at(c - 1, x0, spacing), y) <= 0:
+                c -= 1
+            while c < columns and side(ax, ay, bx, by, _at(c, x0, spacing), y) > 0:
+                c += 1
+            if c < columns and side(ax, ay, bx, by, _at(c, x0, spacing), y) == 0:
+                on[n] = row + c
+                n += 1
+                c += 1
+            if y < by:
+                crossed[m] = row + c
+                m += 1
+    return np.sort(crossed[:m]), np.sort(on[:n])
+
+
 @njit(cache=True)
 def grid_points(segments, spacing):  # type: ignore[no-untyped-def]
     """Points (k, 2) of a square grid of `spacing` m in the free area bounded by closed rings of walls (M, 4).
 
-    Even-odd rule along each row of the grid; the grid starts half a spacing from the lowest x and y.
+    The grid starts half a spacing from the lowest x and y. Points within by the even-odd rule; those on a wall are
+    left out. Both hold exactly for the coordinates as they are, as in `shapely.contains_xy`.
     """
     x0 = min(segments[:, 0].min(), segments[:, 2].min())
     x1 = max(segments[:, 0].max(), segments[:, 2].max())
     y0 = min(segments[:, 1].min(), segments[:, 3].min())
     y1 = max(segments[:, 1].max(), segments[:, 3].max())
-    columns = int((x1 - x0) / spacing)
-    rows = int((y1 - y0) / spacing)
-    inside = np.zeros((rows, columns), np.bool_)
-    for k in range(segments.shape[0]):
-        ax, ay, bx, by = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
-        low = max(math.ceil((min(ay, by) - y0) / spacing - 0.5), 0)
-        for r in range(low, rows):
-            y = y0 + (r + 0.5) * spacing
-            if y >= max(ay, by):
-                break
-            if y < min(ay, by):
+    columns = math.ceil((x1 - x0) / spacing)
+    crossed, on = _crossings(segments, spacing, x0, y0, columns, math.ceil((y1 - y0) / spacing))
+    most = 0
+    for i in range(0, crossed.size - 1, 2):
+        most += crossed[i + 1] - crossed[i]
+    out = np.empty((most, 2))
+    n = j = 0
+    for i in range(0, crossed.size - 1, 2):
+        for number in range(crossed[i], crossed[i + 1]):
+            while j < on.size and on[j] < number:
+                j += 1
+            if j < on.size and on[j] == number:
                 continue
-            # Everything to the right of the crossing changes side.
-            x = ax + (y - ay) / (by - ay) * (bx - ax)
-            first = max(math.ceil((x - x0) / spacing - 0.5), 0)
-            for c in range(first, columns):
-                inside[r, c] = not inside[r, c]
-    found = np.argwhere(inside)
-    out = np.empty((found.shape[0], 2))
-    for i in range(found.shape[0]):
-        out[i, 0] = x0 + (found[i, 1] + 0.5) * spacing
-        out[i, 1] = y0 + (found[i, 0] + 0.5) * spacing
-    return out
+            out[n, 0] = _at(number % (columns + 1), x0, spacing)
+            out[n, 1] = _at(number // (columns + 1), y0, spacing)
+            n += 1
+    return out[:n].copy()
+
+
+@njit(cache=True)
+def side(ax, ay, bx, by, px, py):  # type: ignore[no-untyped-def]
+    """1, 0 or -1: p lies to the left of the line from a to b, on it, or to the right. Exact (Shewchuk 1997)."""
+    left, right = (bx - ax) * (py - ay), (by - ay) * (px - ax)
+    if abs(left - right) > 1e-15 * (abs(left) + abs(right)):
+        return 1 if left > right else -1
+    terms = np.empty(16)
+    n = 0
+    for u in _difference(bx, ax):
+        for v in _difference(py, ay):
+            for term in _product(u, v):
+                n = _add(terms, n, term)
+    for u in _difference(by, ay):
+        for v in _difference(px, ax):
+            for term in _product(u, v):
+                n = _add(terms, n, -term)
+    for i in range(n - 1, -1, -1):
+        if terms[i] != 0.0:
+            return 1 if terms[i] > 0.0 else -1
+    return 0
+
+
+@njit(cache=True)
+def _difference(a, b):  # type: ignore[no-untyped-def]
+    """Rounding error and rounded value of a - b."""
+    x = a - b
+    back = a - x
+    return (a - (x + back)) + (back - b), x
+
+
+@njit(cache=True)
+def _product(a, b):  # type: ignore[no-untyped-def]
+    """Rounding error and rounded value of a * b."""
+    x = a * b
+    wide = 134217729.0 * a  # 2^27 + 1 splits a number into halves
+    a1 = wide - (wide - a)
+    wide = 134217729.0 * b
+    b1 = wide - (wide - b)
+    a2, b2 = a - a1, b - b1
+    return a2 * b2 - (((x - a1 * b1) - a2 * b1) - a1 * b2), x
+
+
+@njit(cache=True)
+def _add(terms, n, value):  # type: ignore[no-untyped-def]
+    """Add a number to a sum kept as n parts, the small ones first, none of which overlaps another; n + 1."""
+    for i in range(n):
+        x = value + terms[i]
+        part = x - value
+        terms[i] = (value - (x - part)) + (terms[i] - part)
+        value = x
+    terms[n] = value
+    return n + 1
 
 
 class Coverage:
     """Which sample points of the free area have been seen from the poses added so far."""
 
     def __init__(self, points: np.ndarray) -> None:
-        """points (k, 2) m, say a 0.2 m grid over the free area.
+        """points (k, 2) m, say a grid over the free area (`grid_points`).
 
         Raises `InvalidMotionError` unless they are finite, of that shape, and at least one.
         """
@@ -205,13 +327,12 @@ class Coverage:
         if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
             raise InvalidMotionError(f"sample points of shape {points.shape}: expected finite (k, 2), k >= 1")
         self._origin = points.min(axis=0)
-        extent = points.max(axis=0) - self._origin
-        self._columns = int(extent[0] / _CELL) + 1
-        rows = int(extent[1] / _CELL) + 1
-        if self._columns * rows > 50_000_000:
-            raise InvalidMotionError(f"sample points spread over {extent[0]:.3g} x {extent[1]:.3g} m: too far apart")
+        wide, high = points.max(axis=0) - self._origin
+        share = _A_CELL / len(points)  # of a cell; so there are never many more cells than points
+        self._size = max(math.sqrt(share * wide * high), share * max(wide, high)) or 1.0
+        self._columns, rows = int(wide / self._size) + 1, int(high / self._size) + 1
         x0, y0 = self._origin
-        self._order, self._starts = _bucket(points[:, 0], points[:, 1], x0, y0, self._columns, rows)
+        self._order, self._starts = _bucket(points[:, 0], points[:, 1], x0, y0, self._size, self._columns, rows)
         self._x, self._y = points[self._order, 0].copy(), points[self._order, 1].copy()
         self._unseen = np.diff(self._starts)
         self._seen = np.zeros(len(points), dtype=np.bool_)
@@ -243,6 +364,7 @@ class Coverage:
             self._order,
             self._starts,
             self._unseen,
+            self._size,
             self._columns,
             self._origin[0],
             self._origin[1],

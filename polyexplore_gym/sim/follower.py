@@ -1,9 +1,12 @@
 """The path follower: from the robot's state to its wheels' command, once per time step.
 
 Pure pursuit with a look-ahead that shrinks with the speed. Sharp corners are driven to, turned at on
-the spot, and left; gentle ones are passed at a speed low enough that the cut stays near 1.5 cm:
-planned paths leave but a few centimetres to the walls. All ramps are braking parabolas in discrete
+the spot, and left; gentle ones are passed at a speed low enough that the cut stays near 6 % of the
+radius: planned paths leave but little more to the walls. All ramps are braking parabolas in discrete
 time, so that the robot comes to rest where it should without overshoot.
+
+Lengths follow from the robot: robot, path and walls made larger together give the same drive, larger.
+Those in radii were tuned on a robot of 0.25 m.
 """
 
 from __future__ import annotations
@@ -13,26 +16,45 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.sim.robot import nearest_wall
+from polyexplore_gym.sim.robot import BENDS, SKIN, nearest_wall, slide
 
-X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT = range(8)
-"""The state, float64 (8,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase, and
-motion lost to a wall (m, see `forget`)."""
-FOLLOW, ALIGN, FINAL, DONE, LOST = range(5)
-"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading, arrived, off the path."""
+X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, MET = range(9)
+"""The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
+motion lost to a wall (m, see `forget`), and whether (0, 1) a wall has taken anything."""
+FOLLOW, ALIGN, FINAL, DONE, LOST, BUMP = range(6)
+"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading; then the drive has ended:
+arrived, off the path, held by a wall."""
 
-_CUT = 0.012
+_CUT = 0.048
+"""How much of a gentle corner may be cut, radii."""
 _SHARP = math.radians(45.0)
-_GOAL_TOLERANCE = 0.004
+_GOAL_TOLERANCE = 0.016
+"""The robot stops when it is so near to the end of a leg, radii."""
 _HEADING_TOLERANCE = math.radians(0.2)
-_LOST = 0.5
-_LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.08, 0.35, 0.3
+_LOST = 2.0
+"""Farther from its leg (radii) the robot is lost: a diameter, as far as a wall can push it and still let it return."""
+_LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.32, 1.4, 0.3
+"""Look-ahead, shortest and longest in radii, and the way driven in so many seconds between."""
+_LOOK_STEPS = 2.0
+"""No nearer than so many steps: an error of heading then decays fastest; from one step on it would grow."""
+_STRAIGHT = 0.02
+"""Where the way turns by more than this (rad) a step is no longer than half the look-ahead, or half the turn."""
 _TURN_SHARE = 0.4
 _MARGIN, _BACKWARD = 0.9, 0.8
 """Shares of the acceleration limits planned with when braking, and between corners; the rest is for corrections."""
 _GRAZING = math.tan(math.radians(15.0)) ** 2
-_LAST_LEG = 0.5
-"""A last leg shorter than this (m) leaves no room to settle on it: the robot stops and turns before it."""
+_LAST_LEG = 2.0
+"""A last leg shorter than this (radii) leaves no room to settle on it: the robot stops and turns before it."""
+_AIM, _TURN_BACK = 0.12, 0.08
+"""Nearer to the end of a leg (radii) the bearing of that end says little: the robot aligns with the leg instead, and
+does not stop to turn any more."""
+_BUMP = 0.08
+"""A drive ends when a wall has taken this much of the commanded motion, radii (2 cm at 0.25 m)."""
+_STALL = 0.04
+"""Wheels that a wall holds turn on with what they reach from rest in this time (s) or in a step, if that is longer:
+a short step makes a bump no later."""
+_ROUNDING = 1e-9
+"""Share of a motion; walls that take less have taken nothing."""
 
 
 @njit(cache=True)
@@ -41,12 +63,13 @@ def _wrap(angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def vertex_speeds(path, limits):  # type: ignore[no-untyped-def]
+def vertex_speeds(path, limits, radius, step):  # type: ignore[no-untyped-def]
     """Highest speed (k,) at each vertex of a path (k, 2): 0 at sharp corners and at the end.
 
     A corner of angle a turned over a length l is cut by about l a / 8 in its middle; turning by a takes at least
     2 sqrt(a / turn acceleration), and 2 a / turn rate. Hence l = 8 cut / a, no longer than the legs, and speed
-    l / time. A backward pass makes every later limit reachable by braking. limits as in `command`.
+    l / time, in two time steps at least. A backward pass makes every later limit reachable by braking. Arguments as in
+    `command`.
     """
     max_speed, max_rate, acceleration, turn_acceleration = limits
     n = path.shape[0]
@@ -63,12 +86,14 @@ def vertex_speeds(path, limits):  # type: ignore[no-untyped-def]
             )
             if turn < 1e-6:
                 out[k] = max_speed
-            elif turn < (0.005 if k == n - 2 and ahead < _LAST_LEG else _SHARP):
-                length = min(8.0 * _CUT / turn, ahead, behind)
+            elif turn < (0.005 if k == n - 2 and ahead < _LAST_LEG * radius else _SHARP):
+                length = min(8.0 * (_CUT * radius) / turn, ahead, behind)
                 out[k] = min(
                     max_speed,
                     length * min(0.5 * math.sqrt(_TURN_SHARE * turn_acceleration / turn), 0.5 * max_rate / turn),
                 )
+                if turn > _STRAIGHT:
+                    out[k] = min(out[k], length / (_LOOK_STEPS * step))
         out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * _BACKWARD * acceleration * ahead))
     return out
 
@@ -115,13 +140,14 @@ def _look_ahead(path, speeds, leg, along, look):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def command(state, path, speeds, heading, final_turn, limits, track, step):  # type: ignore[no-untyped-def]
+def command(state, path, speeds, heading, final_turn, limits, body, step):  # type: ignore[no-untyped-def]
     """Set the speed and turn rate of the state for the next step, and advance its leg and phase.
 
     path (k, 2) without repeated points, speeds (k,) from `vertex_speeds`; heading of the end, used if final_turn;
-    limits: wheel speed, turn rate, acceleration, turn acceleration; track m; step s. Both wheels, at
-    speed -+ rate * track / 2, keep within the wheel speed.
+    limits: wheel speed, turn rate, acceleration, turn acceleration; body: radius and track (m); step s. Both wheels,
+    at speed -+ rate * track / 2, keep within the wheel speed.
     """
+    radius, track = body
     max_speed, max_rate, acceleration, turn_acceleration = limits
     x, y, phi = state[X], state[Y], state[HEADING]
     last_leg = path.shape[0] - 2
@@ -142,25 +168,26 @@ def command(state, path, speeds, heading, final_turn, limits, track, step):  # t
         along = (x - px) * dx + (y - py) * dy
         aside = (y - py) * dx - (x - px) * dy
         left = length - along
-        if abs(aside) > _LOST:
+        if abs(aside) > _LOST * radius:
             state[PHASE] = LOST
             return
         if state[PHASE] == ALIGN:
             # towards the end of the leg from here; too close to it, along the leg
-            aim = math.atan2(dy, dx) if left < 0.03 else math.atan2(path[leg + 1, 1] - y, path[leg + 1, 0] - x)
+            aim = math.atan2(dy, dx) if left < _AIM * radius else math.atan2(path[leg + 1, 1] - y, path[leg + 1, 0] - x)
             if not _rotate(state, _wrap(aim - phi), limits, step):
                 return
             state[PHASE] = FOLLOW
         stops = speeds[leg + 1] <= 0.0
-        if left <= (_GOAL_TOLERANCE if stops else 0.0) and (not stops or state[SPEED] <= acceleration * step):
+        if left <= (_GOAL_TOLERANCE * radius if stops else 0.0) and (not stops or state[SPEED] <= acceleration * step):
             state[LEG] += 1
             if stops:
                 state[PHASE] = FINAL if leg == last_leg else ALIGN
             continue
-        if abs(_wrap(math.atan2(dy, dx) - phi)) > 1.5 * _SHARP and left > 0.02:
+        if abs(_wrap(math.atan2(dy, dx) - phi)) > 1.5 * _SHARP and left > _TURN_BACK * radius:
             state[PHASE] = ALIGN
             continue
-        look = min(max(_LOOK_TIME * state[SPEED], _LOOK_MIN), _LOOK_MAX)
+        look = min(max(_LOOK_TIME * state[SPEED], _LOOK_MIN * radius), _LOOK_MAX * radius)
+        look = max(look, _LOOK_STEPS * state[SPEED] * step)
         tx, ty = _look_ahead(path, speeds, leg, max(along, 0.0), look)
         off = _wrap(math.atan2(ty - y, tx - x) - phi)
         curvature = 2.0 * math.sin(off) / max(math.hypot(tx - x, ty - y), 0.5 * look)
@@ -168,6 +195,8 @@ def command(state, path, speeds, heading, final_turn, limits, track, step):  # t
         if curvature != 0.0:
             wish = min(wish, max_rate / abs(curvature))
         wish = min(wish, max_speed / (1.0 + 0.5 * track * abs(curvature)))
+        if abs(aside) > _CUT * radius or abs(off) > _STRAIGHT:  # back to the leg in several steps
+            wish = min(wish, _LOOK_MAX * radius / (_LOOK_STEPS * step))
         # slow enough to turn towards the point before it is reached, as at the vertices
         wish = min(wish, 0.5 * look * math.sqrt(_TURN_SHARE * turn_acceleration / max(abs(off), 1e-6)))
         state[SPEED] = max(0.0, _towards(state[SPEED], wish, acceleration * step))
@@ -189,30 +218,66 @@ def forget(state, progress):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def run_free(state, path, speeds, heading, final_turn, limits, track, step, walls, radius, trajectory):  # type: ignore[no-untyped-def]
-    """Follow the path as long as no wall is in reach: what a physics engine without contacts would integrate.
+def _push(state, acceleration, step, walls, radius, bends):  # type: ignore[no-untyped-def]
+    """One step among walls in reach: they take what of the motion leads into them. Returns the number of bends."""
+    x, y = state[X], state[Y]
+    c, s = math.cos(state[HEADING]), math.sin(state[HEADING])
+    moved = state[SPEED] * step
+    n = slide(walls, x, y, state[SPEED] * c * step, state[SPEED] * s * step, radius, bends)
+    state[X], state[Y] = bends[n - 1]
+    progress = (state[X] - x) * c + (state[Y] - y) * s
+    lost = moved - progress
+    if lost > _ROUNDING * moved:
+        state[DEFICIT] += lost
+        state[MET] = 1.0
+        state[SPEED] = max(progress / step, min(state[SPEED], acceleration * max(_STALL - step, 0.0)))
+    forget(state, progress)
+    return n
 
-    walls (W, 4): those near the path. Fills trajectory (n, 3) and returns (rows filled, contact): with contact
-    True the command for the next step is set but not executed, for that step would run into a wall.
-    Motion along a wall or away from it is free even while the disc touches it.
+
+@njit(cache=True)
+def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, walls, box, trajectory):  # type: ignore[no-untyped-def]
+    """Follow the path for at most so many steps.
+
+    body: radius and track (m). walls (W, 4): all those that meet the box (x, y min, x, y max). Fills trajectory
+    (n, 3), n > `BENDS`: the pose after every step, and on the way where walls bend it. Returns (rows filled, steps
+    done); it ends early when the phase is `DONE` or later, when the trajectory is full, and before a step that might
+    leave the box.
     """
-    clear = nearest_wall(walls, state[X], state[Y])[0] - radius  # at least so far to the nearest wall
-    for row in range(trajectory.shape[0]):
-        command(state, path, speeds, heading, final_turn, limits, track, step)
+    radius = body[0]
+    bends = np.empty((BENDS, 2))
+    clear = 0.0  # at least so far to the nearest wall
+    row = 0
+    for done in range(steps):
+        if row + BENDS > trajectory.shape[0]:
+            return row, done
+        x, y = state[X], state[Y]
+        far = (1.0 + SKIN) * radius + min(state[SPEED] + limits[2] * step, limits[0]) * step
+        if x - far < box[0] or y - far < box[1] or x + far > box[2] or y + far > box[3]:
+            return row, done
+        command(state, path, speeds, heading, final_turn, limits, body, step)
         if state[PHASE] >= DONE:
-            return row, False
+            return row, done
         # position first, then angle, each from the velocities at the start of the step, as Chipmunk does
-        x = state[X] + state[SPEED] * math.cos(state[HEADING]) * step
-        y = state[Y] + state[SPEED] * math.sin(state[HEADING]) * step
         moved = state[SPEED] * step
+        if moved > clear:
+            clear = nearest_wall(walls, x, y)[0] - (1.0 + 2.0 * SKIN) * radius
+        n = 1
         if moved <= clear:
+            state[X] = x + state[SPEED] * math.cos(state[HEADING]) * step
+            state[Y] = y + state[SPEED] * math.sin(state[HEADING]) * step
+            bends[0, 0], bends[0, 1] = state[X], state[Y]
+            forget(state, moved)
             clear -= moved
         else:
-            clear = nearest_wall(walls, x, y)[0] - radius
-            if clear < 0.0 and clear < nearest_wall(walls, state[X], state[Y])[0] - radius - 1e-9:
-                return row, True
-        state[X], state[Y] = x, y
+            n = _push(state, limits[2], step, walls, radius, bends)
+            clear = 0.0
+        for k in range(n):
+            trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = bends[k, 0], bends[k, 1], state[HEADING]
+            row += 1
         state[HEADING] = _wrap(state[HEADING] + state[RATE] * step)
-        forget(state, moved)
-        trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = x, y, state[HEADING]
-    return trajectory.shape[0], False
+        trajectory[row - 1, 2] = state[HEADING]
+        if state[DEFICIT] > _BUMP * radius:
+            state[PHASE] = BUMP
+            return row, done + 1
+    return row, steps

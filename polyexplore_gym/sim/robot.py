@@ -1,8 +1,8 @@
-"""The robot's disc body among walls, and its motion along a path without dynamics.
+"""The robot's disc body among walls: where it touches, how it slides, and its motion along a path without dynamics.
 
-Kernels on arrays: walls (M, 4), points in metres. The distance from a moving point to a wall
+Kernels on arrays: walls (M, 4), points in metres. The distance from a point that moves straight to a wall
 segment is convex in time, so a disc that starts clear of a wall meets it at most once, and one that
-touches it and moves away never meets it again.
+touches it and does not move closer never meets it again.
 """
 
 from __future__ import annotations
@@ -12,10 +12,19 @@ import math
 import numpy as np
 from numba import njit
 
-STANDOFF = 1e-3
-"""How far from a wall (m) a kinematic robot stops that would bump into it."""
-_GRAZE = 1e-9
-"""A disc that dips less than this (m) into a wall does not touch it."""
+STANDOFF = 0.004
+"""How far from a wall a kinematic robot stops that would bump into it, in radii (1 mm at a radius of 0.25 m)."""
+_GRAZE = 4e-9
+"""A disc that dips less than this, in radii, into a wall does not touch it when it glides along a path."""
+SKIN = 1e-7
+"""A disc that slides keeps this far from walls, in radii, so that no rounding lets it overlap; nearer than twice as
+far it touches."""
+_ARC = 0.05
+"""Round the end of a wall a disc slides in pieces of this length, in radii; it strays outwards by half its square."""
+BENDS = 256
+"""Pieces into which one motion of a sliding disc is broken at most; what is left then is lost to the walls."""
+_PARALLEL = 1e-10
+"""Sine of the angle to a wall below which a motion is along it: rounding, for walls up to 10 km from the origin."""
 
 
 @njit(cache=True)
@@ -78,8 +87,8 @@ def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
         height, rate = -(ax * nx + ay * ny), dx * nx + dy * ny  # signed height of the point over the line
         if height < 0.0:
             height, rate = -height, -rate
-        if rate < 0.0 and height >= radius:
-            t = (height - radius) / -rate
+        if rate < 0.0:
+            t = max(height - radius, 0.0) / -rate  # beside the wall it is higher, but for rounding
             along = ((t * dx - ax) * ex + (t * dy - ay) * ey) / length2
             if t <= 1.0 and 0.0 <= along <= 1.0:
                 return t
@@ -87,9 +96,9 @@ def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
     for end in range(2):  # the round ends
         cx, cy = (ax, ay) if end == 0 else (bx, by)
         half = cx * dx + cy * dy
-        gap = cx * cx + cy * cy - radius * radius
+        gap = max(cx * cx + cy * cy - radius * radius, 0.0)
         root = half * half - square * gap
-        if half > 0.0 and gap >= 0.0 and root >= 0.0:
+        if half > 0.0 and root >= 0.0:
             t = gap / (half + math.sqrt(root))
             if t <= 1.0:
                 first = min(first, t)
@@ -100,11 +109,12 @@ def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
 def first_contact(segments, x, y, dx, dy, radius, standoff):  # type: ignore[no-untyped-def]
     """How far a disc at (x, y) gets along (dx, dy) before it touches a wall.
 
-    Returns (contact, stop): the share of the motion at which it touches, inf if it never does, and the share at
-    which its rim is still `standoff` from that wall (0 if it starts closer). A disc that touches a wall already
-    is only held by it if it moves into it.
+    standoff m. Returns (contact, stop): the share of the motion at which it touches, inf if it never does, and the
+    share at which its rim is still `standoff` from that wall (0 if it starts closer). A disc that touches a wall
+    already is only held by it if it moves into it.
     """
     contact, stop = np.inf, np.inf
+    graze = _GRAZE * radius
     reach = radius + standoff
     x_min, x_max = x + min(0.0, dx) - reach, x + max(0.0, dx) + reach
     y_min, y_max = y + min(0.0, dy) - reach, y + max(0.0, dy) + reach
@@ -114,11 +124,113 @@ def first_contact(segments, x, y, dx, dy, radius, standoff):  # type: ignore[no-
         x1, y1, x2, y2 = segments[k]
         if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
             continue
-        t = _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, radius - _GRAZE)
+        t = _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, radius - graze)
         if t < contact:
             contact = t
             stop = min(t, _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
     return contact, stop
+
+
+@njit(cache=True)
+def _touching(segments, x, y, radius):  # type: ignore[no-untyped-def]
+    """Walls that a disc touches: index, normal (towards the disc) and place of the contact along the wall (0 to 1)."""
+    out = np.empty((segments.shape[0], 4))
+    n, reach = 0, radius * (1.0 + 2.0 * SKIN)
+    for k in range(segments.shape[0]):
+        x1, y1, x2, y2 = segments[k]
+        if max(x1, x2) < x - reach or min(x1, x2) > x + reach or max(y1, y2) < y - reach or min(y1, y2) > y + reach:
+            continue
+        ex, ey = x2 - x1, y2 - y1
+        length2 = ex * ex + ey * ey
+        t = 0.0
+        if length2 > 0.0:
+            t = min(1.0, max(0.0, ((x - x1) * ex + (y - y1) * ey) / length2))
+        nx, ny = x - x1 - t * ex, y - y1 - t * ey
+        distance = math.hypot(nx, ny)
+        if distance <= reach:
+            if distance > 0.0:
+                nx, ny = nx / distance, ny / distance
+            out[n, 0], out[n, 1], out[n, 2], out[n, 3] = k, nx, ny, t
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True)
+def _into_none(touched, dx, dy, depth):  # type: ignore[no-untyped-def]
+    """Whether a motion leads into none of the walls touched, or no deeper."""
+    deepest = 0.0
+    for i in range(touched.shape[0]):
+        deepest = max(deepest, -(dx * touched[i, 1] + dy * touched[i, 2]))
+    return deepest <= depth
+
+
+@njit(cache=True)
+def _allowed(touched, dx, dy):  # type: ignore[no-untyped-def]
+    """What the walls touched leave of a motion without friction: (dx, dy, row of the wall slid along or -1).
+
+    The nearest motion that leads into none of them: the whole, that along one of them, or none.
+    """
+    depth = _PARALLEL * math.hypot(dx, dy)
+    if _into_none(touched, dx, dy, depth):
+        return dx, dy, -1
+    for i in range(touched.shape[0]):
+        nx, ny = touched[i, 1], touched[i, 2]
+        into = dx * nx + dy * ny
+        vx, vy = dx - into * nx, dy - into * ny
+        if into < 0.0 and _into_none(touched, vx, vy, depth):
+            return vx, vy, i
+    return 0.0, 0.0, -1
+
+
+@njit(cache=True)
+def _straight(segments, touched, row, vx, vy, radius):  # type: ignore[no-untyped-def]
+    """How long (share of the motion) a disc slides straight: to a little past the end of the wall it slides along."""
+    x1, y1, x2, y2 = segments[int(touched[row, 0])]
+    length = math.hypot(x2 - x1, y2 - y1)
+    left = 0.0
+    if 0.0 < touched[row, 3] < 1.0:
+        forward = vx * (x2 - x1) + vy * (y2 - y1) > 0.0
+        left = length * ((1.0 - touched[row, 3]) if forward else touched[row, 3])
+    return (left + _ARC * radius) / math.hypot(vx, vy)
+
+
+@njit(cache=True)
+def slide(segments, x, y, dx, dy, radius, bends):  # type: ignore[no-untyped-def]
+    """Move a disc by (dx, dy); walls take what leads into them, without friction.
+
+    Swept from contact to contact, so that no motion is too long. bends (`BENDS`, 2) takes the points at which its way
+    bends, the last being its end; returns how many they are, at least 1.
+    """
+    left, n = 1.0, 0
+    reach = radius * (1.0 + SKIN)
+    while n < BENDS:
+        touched = _touching(segments, x, y, radius)
+        vx, vy, row = _allowed(touched, dx, dy)
+        if vx == 0.0 and vy == 0.0:
+            break
+        share = left if row < 0 else min(left, _straight(segments, touched, row, vx, vy, radius))
+        mx, my = vx * share, vy * share
+        x_min, x_max = x + min(0.0, mx) - reach, x + max(0.0, mx) + reach
+        y_min, y_max = y + min(0.0, my) - reach, y + max(0.0, my) + reach
+        free, i = 1.0, 0
+        for k in range(segments.shape[0]):
+            if i < touched.shape[0] and touched[i, 0] == k:  # not moved closer to
+                i += 1
+                continue
+            x1, y1, x2, y2 = segments[k]
+            if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
+                continue
+            free = min(free, _enters(x1 - x, y1 - y, x2 - x, y2 - y, mx, my, reach))
+        x, y = x + mx * free, y + my * free
+        bends[n, 0], bends[n, 1] = x, y
+        n += 1
+        left -= share * free
+        if left <= 0.0:
+            break
+    if n == 0:
+        bends[0, 0], bends[0, 1] = x, y
+        n = 1
+    return n
 
 
 @njit(cache=True)
@@ -175,7 +287,7 @@ def glide(segments, pose, path, heading, final_turn, radius, limits, time_limit)
             time += profile_time(abs(turn), rate, turn_acceleration)
         if last:
             break
-        contact, stop = first_contact(segments, x, y, dx, dy, radius, STANDOFF)
+        contact, stop = first_contact(segments, x, y, dx, dy, radius, STANDOFF * radius)
         if contact <= 1.0:
             collided = True
             dx, dy, length = dx * stop, dy * stop, length * stop

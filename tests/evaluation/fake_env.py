@@ -1,7 +1,7 @@
 """A stand-in for the environment: points to visit in the open, with the contract's observation and info.
 
 It is quick, so that studies of hundreds of episodes can be killed and repeated, and it can be made to
-fail or never to end by the plan's meta data.
+fail, never to end or to end with points left by the plan's meta data.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class FakeEnv(gymnasium.Env):
         self.distance, self.steps, self.bad = 0.0, 0, False
         if self.plan.meta.get("seen_at_once"):
             self.open[:] = 0
-        return self._observation(), self._info()
+        return self._observation(), self._info(truncated=False)
 
     def step(self, action):
         meta = self.plan.meta
@@ -58,7 +58,7 @@ class FakeEnv(gymnasium.Env):
             self.open[action] = 0
         terminated = not self.open.any()
         truncated = not terminated and self.steps >= meta.get("budget", 100)
-        return self._observation(), -1.0, terminated, truncated, self._info()
+        return self._observation(), -1.0, terminated, truncated, self._info(truncated)
 
     def _observation(self):
         gaps = np.hypot(*(self.nodes[:, None] - self.nodes[None]).T).T
@@ -74,7 +74,9 @@ class FakeEnv(gymnasium.Env):
             "path_lengths": gaps.astype(np.float32),
         }
 
-    def _info(self):
+    def _info(self, truncated):
+        left = self.plan.meta.get("left", 0)
+        status = "budget" if truncated else "running" if self.open.any() else "unreached" if left else "complete"
         seen = 1.0 - 0.6 * self.open.mean()
         return {
             "action_mask": self.open.copy(),
@@ -84,6 +86,13 @@ class FakeEnv(gymnasium.Env):
             "sim_time": 2.0 * self.distance,
             "collisions": 0,
             "invalid_action": self.bad,
+            "outcome": {
+                "status": status,
+                "unreached": left,
+                "unreached_length": 1.25 * left,
+                "given_up": int(left > 1),
+                "given_up_length": 0.5 * (left > 1),
+            },
             "cut": {"nodes": 0, "lines": 0},
         }
 

@@ -31,7 +31,7 @@ def records(study):
 
 def test_records_do_not_depend_on_workers_or_order(study, records, tmp_path):
     assert evaluate(study, out=tmp_path, workers=2, progress=False) == records
-    assert {r.status for r in records} == {"complete"}
+    assert all(r.ended for r in records)
     for r in records:
         assert (np.diff(r.curve_distance) >= 0).all()
         assert (np.diff(r.curve_coverage) >= 0).all()

@@ -9,6 +9,7 @@ import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import fake_env
 import numpy as np
 import pytest
 from PIL import Image
@@ -145,7 +146,7 @@ def test_tables_hold_the_figures_of_the_summary(page, results):
                 assert found == pytest.approx(float(figures[f"distance_{name}"]), abs=0.0501)
     records = sorted(read_records(results), key=lambda r: r.key)
     ratios = {(row[0], row[1], row[2]): row for table in page.tables["results"][1:] for row in table[1:]}
-    done = {(r.policy, r.placement, r.plan_hash, r.seed): r.distance for r in records if r.complete}
+    done = {(r.policy, r.placement, r.plan_hash, r.seed): r.distance for r in records if r.ended}
     common = {(h, s) for p, where, h, s in done if where == "midpoint"}
     common = {pair for pair in common if all((p, "midpoint", *pair) in done for p in ("nearest", f"{__name__}:Broken"))}
     logs = [np.log(done["random", "midpoint", *k] / done["nearest", "midpoint", *k]) for k in common]
@@ -164,8 +165,8 @@ def test_failures_parts_and_set_up_are_told(page, results):
     failed = [r for r in read_records(results) if r.status == "failed"]
     assert failed
     rows = page.tables["failures"][0][1:]
-    assert len(rows) == len(failed)
-    assert {row[-1] for row in rows} == {r.error for r in failed}  # as text, not as a script
+    assert sum(row[4] == "failed" for row in rows) == len(failed)
+    assert {row[-1] for row in rows if row[4] == "failed"} == {r.error for r in failed}  # as text, not as a script
     assert "rooms <1.2>" in page.text
     for table, placement in zip(page.tables["breakdown"], ("midpoint", "in_front"), strict=True):
         assert table[0] == ["plans", "starts", "random", "modified_sum", f"{__name__}:Broken"]
@@ -183,6 +184,22 @@ def test_failures_parts_and_set_up_are_told(page, results):
     assert "32 of 32" not in page.text
     assert "64 of 64" in page.text
     assert "missing" not in page.ids
+
+
+def test_jump_edges_that_are_left_are_told(tmp_path):
+    plans = [fake_env.plan(0, left=2), fake_env.plan(1), fake_env.plan(2)]
+    study = Study(policies=name_policies(["nearest", "random"]), plans=plans)
+    evaluate(study, out=tmp_path, progress=False, make_env=fake_env.FakeEnv)
+    page = Page(render_report(tmp_path, runs=0, make_env=fake_env.FakeEnv))
+    header, *rows = page.tables["failures"][0]
+    assert [dict(zip(header, row, strict=True)) for row in rows] == [
+        {"policy": policy, "placement": "midpoint", "plan": "square 0", "seed": "0", "what": "unreached", "m": row[5],
+         "seen %": "100.0", "edges left": "3, 3.0 m", "error": ""}
+        for policy, row in zip(("nearest", "random"), rows, strict=True)
+    ]  # fmt: skip
+    assert "2 episodes that are compared left jump edges: 4 (5.0 m) out of reach, 2 (1.0 m) given up" in page.text
+    header, *rows = page.tables["results"][0]
+    assert {dict(zip(header, row, strict=True))["complete"] for row in rows} == {"2/3 (1 unreached)"}
 
 
 def test_runs_are_drawn_as_they_were(page):

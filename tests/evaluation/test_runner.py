@@ -97,6 +97,30 @@ def test_failures_and_truncations_are_recorded(tmp_path):
     assert run(study([Fussy(), Stubborn(), "nearest"], plans=8, seeds=(0,), budget=12), tmp_path) == records
 
 
+def test_jump_edges_that_are_left_are_recorded(tmp_path):
+    (record,) = run(study(["nearest"], plans=1, seeds=(0,), placements=("midpoint",), left=2), tmp_path)
+    assert (record.status, record.complete, record.ended) == ("unreached", False, True)
+    left = record.unreached, record.unreached_length, record.given_up, record.given_up_length
+    assert left == (2, 2.5, 1, 0.5)
+    assert read_records(tmp_path) == [record]
+    (cut,) = run(study([Stubborn()], plans=1, seeds=(0,), placements=("midpoint",), left=2, budget=3))
+    assert (cut.status, cut.ended, cut.unreached) == ("truncated", False, 2)
+    (seen,) = run(study(["nearest"], plans=1, seeds=(0,), placements=("midpoint",), seen_at_once=True, left=1))
+    assert (seen.status, seen.decisions, seen.unreached, seen.given_up) == ("unreached", 0, 1, 0)
+
+
+def test_an_end_without_a_word_is_no_result():
+    class Silent(FakeEnv):
+        def _info(self, truncated):
+            info = super()._info(truncated)
+            info["outcome"]["status"] = "running"
+            return info
+
+    record = run_episode(Silent(EnvConfig()), load_policy("nearest"), plan(0), 0, label="nearest")
+    assert record.status == "failed"
+    assert "info['outcome'] says 'running'" in record.error
+
+
 def test_an_action_that_is_none_fails_the_episode_only():
     class Mute:
         def act(self, observation, info, rng):

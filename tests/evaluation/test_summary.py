@@ -17,8 +17,8 @@ from polyexplore_gym.evaluation import (
     write_tables,
 )
 from polyexplore_gym.evaluation.plots import coverage_figure, improvement_figure, profile_figure, ratio_figure, save
-from polyexplore_gym.evaluation.summary import completed
-from polyexplore_gym.evaluation.tables import format_table
+from polyexplore_gym.evaluation.summary import finished
+from polyexplore_gym.evaluation.tables import format_table, summary_csv
 
 
 def record(policy, number, distance, *, seed=0, placement="midpoint", status="complete", group=None, **more):
@@ -74,7 +74,7 @@ def test_means_and_ratios_by_hand():
     assert summary.between_placements == []
 
 
-def test_only_starts_that_all_completed_are_compared():
+def test_only_starts_that_all_finished_are_compared():
     records = []
     for i in range(6):
         records += [
@@ -95,7 +95,7 @@ def test_only_starts_that_all_completed_are_compared():
     assert summary.against_reference[0].pairs == 4
     notes = "\n".join(summary.notes)
     assert "midpoint: compared on 4 of 6 starts" in notes
-    assert "left out of the comparison, as nothing was completed: broken" in notes
+    assert "left out of the comparison, as nothing was finished: broken" in notes
     assert "b failed on plan 1 (seed 0): ValueError: no" in notes
     text = summary_text(summary)
     assert "5/6 (1 cut off)" in text
@@ -244,12 +244,35 @@ def test_improvement_shows_every_comparison():
     assert [tick.get_text() for tick in panel.get_yticklabels()] == ["b", "c"]
 
 
+def test_ways_that_leave_jump_edges_are_compared_and_told():
+    records = [record("nearest", i, 10.0) for i in range(4)] + [record("b", i, 20.0) for i in range(4)]
+    left = {"unreached": 2, "unreached_length": 1.5, "given_up": 1, "given_up_length": 0.25}
+    records[5] = record("b", 1, 20.0, status="unreached", **left)
+    records[6] = record("b", 2, 40.0, status="unreached", unreached=1, unreached_length=1.0)
+    short = dataclasses.replace(record("b", 3, 1.0, status="unreached", **left), coverage=0.9)
+    records[7] = short
+    assert finished(records) == [r for r in records if r is not short]
+    summary = figures(records)
+    row = next(row for row in summary.rows if row.policy == "b")
+    assert (row.episodes, row.complete, row.unreached, row.short, row.truncated, row.failed) == (4, 1, 2, 1, 0, 0)
+    assert summary.against_reference[0].ratios == pytest.approx((2.0, 2.0, 4.0))
+    assert "2 episodes that are compared left jump edges: 3 (2.5 m) out of reach, 1 (0.2 m) given up" in "\n".join(
+        summary.notes
+    )
+    assert "1/4 (2 unreached, 1 short)" in summary_text(summary)
+    (_, line) = sorted(csv.DictReader(io.StringIO(summary_csv(summary))), key=lambda line: -float(line["complete"]))
+    assert (line["complete"], line["unreached"], line["short"]) == ("1", "2", "1")
+    # Curves and profiles are of what is compared.
+    assert {line.get_label() for line in profile_figure(records).axes[0].get_lines()} == {"nearest", "b"}
+    assert coverage_figure(records).axes[0].get_title() == "midpoint (3 starts)"
+
+
 def test_giving_up_early_does_not_win():
     records = [record("nearest", i, 10.0) for i in range(4)] + [record("b", i, 20.0) for i in range(4)]
     early = dataclasses.replace(record("b", 1, 1.0), coverage=0.97)
     nearly = dataclasses.replace(record("b", 2, 20.0), coverage=0.985)
     records[5], records[6] = early, nearly
-    assert completed(records) == [r for r in records if r is not early]
+    assert finished(records) == [r for r in records if r is not early]
     summary = figures(records)
     rows = {row.policy: row for row in summary.rows}
     assert (rows["b"].complete, rows["b"].short, rows["nearest"].short) == (3, 1, 0)

@@ -256,6 +256,10 @@ def dumbbell(width: float, size: float = 4.0) -> FloorPlan:
 
 def test_connected_for_the_robot():
     dumbbell(0.7).check_connected(0.3)
+    # The planner keeps a little off the walls: a passage as wide as the robot is none.
+    dumbbell(2 * 0.3 * 1.021).check_connected(0.3)
+    with pytest.raises(InvalidFloorPlanError, match="not connected"):
+        dumbbell(2 * 0.3 * 1.015).check_connected(0.3)
     with pytest.raises(InvalidFloorPlanError, match=r"dumbbell: exterior, vertex \d+: .* not connected .* 0.3 m"):
         dumbbell(0.59).check_connected(0.3)
     with pytest.raises(InvalidFloorPlanError, match="no room for a robot"):
@@ -337,6 +341,6 @@ def test_start_gives_up_the_margin_where_it_must():
 
 def test_start_in_a_thin_diagonal_plan():
     """The bounding box is nearly all outside; sampling still ends."""
-    plan = FloorPlan.create([[0, 0], [0.8, 0], [5000, 4999.2], [5000, 5000]])
+    plan = FloorPlan.create([[0, 0], [0.8, 0], [990, 989.2], [990, 990]])
     start = plan.sample_start(np.random.default_rng(0), 0.25, margin=0.0)
     assert plan.clearance(start[:2])[0] >= 0.25

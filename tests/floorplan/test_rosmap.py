@@ -8,9 +8,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
 from polyexplore_gym.floorplan import generate, load_plan
-from polyexplore_gym.floorplan.rosmap import select_region, vectorise
+from polyexplore_gym.floorplan.rosmap import Reached, vectorise
 
 
 def pixels(region):
@@ -41,7 +41,7 @@ def room(height=40, width=60, free=254):
 def test_outline_is_exactly_that_of_the_pixels(seed, blur):
     noise = np.random.default_rng(seed).uniform(size=(25, 30))
     mask = cv2.GaussianBlur(noise, (0, 0), blur) > 0.5
-    region = select_region(mask, 0)
+    region = Reached(mask, 0).region
     polygon = vectorise(region)
     assert polygon.is_valid
     assert polygon.equals(pixels(region))
@@ -55,8 +55,12 @@ def test_largest_region_or_that_with_the_start(tmp_path):
     image[5:35, 5:65] = 254
     image[5:35, 70:95] = 254
     path = write_map(tmp_path, image)
-    assert load_plan(path).area == pytest.approx(60 * 30 * 0.05**2)
-    assert load_plan(path, start=(4.0, 1.0)).area == pytest.approx(25 * 30 * 0.05**2)
+    with pytest.warns(
+        FloorPlanWarning, match=r"reaches 71 % of the floor \(4.5 m2\); the largest part left out, 1.9 m2"
+    ):
+        assert load_plan(path).area == pytest.approx(60 * 30 * 0.05**2)
+    with pytest.warns(FloorPlanWarning, match="reaches 29 % .*is not connected with it"):
+        assert load_plan(path, start=(4.0, 1.0)).area == pytest.approx(25 * 30 * 0.05**2)
     for start, message in [((3.4, 1.0), "not free"), ((9.0, 1.0), "outside the map"), ((np.nan, 1.0), "finite")]:
         with pytest.raises(InvalidFloorPlanError, match=rf"map\.yaml: .*{message}"):
             load_plan(path, start=start)
@@ -70,7 +74,8 @@ def test_cracks_that_the_robot_cannot_pass_are_closed(tmp_path):
     image[5:35, 70:125] = 254
     image[20:24, 60:75] = 254
     path = write_map(tmp_path, image)
-    plan = load_plan(path, radius=0.25)
+    with pytest.warns(FloorPlanWarning, match=r"a passage of 0\.20 m at .* a radius of 0\.09\d? m would keep 95 %"):
+        plan = load_plan(path, radius=0.25)
     plan.check_connected(0.25)
     assert 60 * 30 * 0.05**2 <= plan.area < 60 * 30 * 0.05**2 + 0.1
     both = load_plan(path, radius=0.0)
@@ -103,12 +108,16 @@ def test_negate_and_thresholds(tmp_path):
     grey = room(free=200)
     with pytest.raises(InvalidFloorPlanError, match="no free pixel"):
         load_plan(write_map(tmp_path, grey))
-    assert load_plan(write_map(tmp_path, grey, free_thresh=0.25)).content_hash == plain.content_hash
-    # Unknown is an obstacle until the threshold makes it free.
+    with pytest.warns(FloorPlanWarning, match="100 % of the plan is of the one grey 200"):
+        again = load_plan(write_map(tmp_path, grey, free_thresh=0.25))
+    assert again.content_hash == plain.content_hash
+    # Unknown is an obstacle, and grey 205 is unknown even if the threshold makes it free.
     unknown = room()
     unknown[unknown == 0] = 205
     assert load_plan(write_map(tmp_path, unknown)).content_hash == plain.content_hash
-    assert load_plan(write_map(tmp_path, unknown, free_thresh=0.25)).area == pytest.approx(40 * 60 * 0.05**2)
+    with pytest.warns(FloorPlanWarning, match="grey 205 is taken for unknown"):
+        again = load_plan(write_map(tmp_path, unknown, free_thresh=0.25))
+    assert again.content_hash == plain.content_hash
 
 
 @pytest.mark.parametrize("suffix", [".png", ".pgm", ".bmp"])
@@ -186,10 +195,12 @@ def test_simplification_obeys_the_tolerance(tmp_path):
         ({"origin": [0, 0, 0, 0]}, "origin .* expected"),
         ({"origin": "here"}, "origin 'here': expected"),
         ({"origin": [0, float("inf"), 0]}, "origin inf: expected a finite number"),
+        ({"origin": [0, 0, 90]}, r"origin \[0, 0, 90\]: the yaw is in radians"),
         ({"negate": 2}, "negate 2: must be 0 or 1"),
         ({"occupied_thresh": 1.5}, "occupied_thresh .* must lie in 0 to 1"),
         ({"occupied_thresh": 0.1}, "free_thresh .* must not exceed"),
-        ({"mode": "raw"}, "mode 'raw'"),
+        ({"mode": "rwa"}, "mode 'rwa': known are trinary, scale, raw"),
+        ({"free_treshold": 0.2, "free_thresh": ...}, "'free_treshold': unknown key; is 'free_thresh' meant"),
     ],
 )
 def test_bad_yaml_fields(tmp_path, fields, message):
@@ -235,7 +246,7 @@ def test_an_image_path_alone_is_refused(tmp_path):
         load_plan(tmp_path / "map.pgm")
 
 
-@pytest.mark.parametrize("arguments", [{"radius": -1.0}, {"radius": np.nan}, {"tolerance": -0.1}])
+@pytest.mark.parametrize("arguments", [{"radius": -1.0}, {"radius": np.nan}])
 def test_bad_arguments(tmp_path, arguments):
     with pytest.raises(InvalidFloorPlanError, match="must be a finite number of metres"):
         load_plan(write_map(tmp_path, room()), **arguments)

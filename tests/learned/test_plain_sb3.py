@@ -14,7 +14,7 @@ def test_the_example_learns_and_explores():
     torch.set_num_threads(1)
     policy = Trained(train(64, horizon=16))
     record = run_episode(PolyExploreEnv(config=CONFIG), policy, suite("home-validation").plan(3), 0, label="plain")
-    assert record.status == "complete"
+    assert record.ended
     assert record.invalid_actions == 0
 
 
