@@ -149,17 +149,17 @@ def test_carmen_logs_with_odd_numbers(tmp_path, first, last):
         lines = [line.split() for line in (carmen() if seed % 2 else robotlaser()).splitlines()]
         for _ in range(int(rng.integers(1, 4))):
             line = lines[int(rng.integers(len(lines)))]
-            at = int(rng.integers(len(line)))
+            at = int(rng.integers(len(line) + 1))
             match int(rng.integers(4)):
                 case 0:
-                    line[at] = str(rng.choice([*ODD, 3, 99999999, -7]))
+                    line[at : at + 1] = [str(rng.choice([*ODD, 3, 99999999, -7]))]
                 case 1:
                     del line[at:]
                 case 2:
                     line.insert(at, str(rng.choice(ODD)))
                 case _:
                     other = lines[int(rng.integers(len(lines)))]
-                    line[at:] = other[int(rng.integers(len(other))) :]
+                    line[at:] = other[int(rng.integers(len(other) + 1)) :]
         path.write_text("\n".join(map(" ".join, lines)))
         read(path)
 
