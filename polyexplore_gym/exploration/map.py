@@ -419,31 +419,27 @@ class ExplorationMap:
         g.recycle()
 
     def _look_again(self) -> bool:
-        """Before all ends: what was given up gets one more visit, and slits count. Whether there is any of either."""
+        """Before all ends: what was given up gets one more visit, on the map as it is now. Whether there is any."""
         p, most = self.pieces, VISIT * self.config.max_visits
         again = ~p.settled & ~p.retried & (p.visits >= most)
-        slits = self.least_width > self.tol.slit
-        if not (slits or again.any()):
+        if not again.any():
             return False
-        self.least_width = min(self.least_width, self.tol.slit)
-        before = self.chains.size
         p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
         all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
         self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
-        return self.chains.size > before or bool(again.any())
+        return self.chains.size > 0
 
     def remains(self) -> Remains:
         """The jump edges that are left: out of reach, and given up."""
         c, p = self.chains, self.pieces
-        wide = c.width >= self.tol.gap - 3.0 * self.tol.sigma_range
-        out = wide & ~self.reachable
+        out = ~self.reachable
         given_up = np.flatnonzero(~p.settled & (p.visits >= VISIT * self.config.max_visits))
         order, offsets = jump_edges.link(p.segments[given_up], p.sigma[given_up], self._walls, self.tol)
         rows = given_up[order]
         lost = jump_edges.summarise(
             p.segments[rows], p.kind[rows], p.visits[rows], np.arange(len(rows)), offsets, self._walls, 0, self.tol
         )
-        wide = lost.width >= self.tol.gap - 3.0 * self.tol.sigma_range
+        wide = lost.width >= self.least_width
         return Remains(int(out.sum()), float(c.length[out].sum()), int(wide.sum()), float(lost.length[wide].sum()))
 
     def _way_out(self, x: float, y: float) -> list[tuple[float, float]]:

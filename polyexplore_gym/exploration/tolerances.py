@@ -29,9 +29,6 @@ class Tolerances(NamedTuple):
     gap: float
     """smallest gap of interest: the disc's diameter"""
 
-    slit: float
-    """before an exploration ends, openings down to this are looked at: through one floor may be seen"""
-
     nudge: float
     """an open edge is resolved where something deeper than this (and the noise) is seen behind it"""
     cover: float
@@ -127,7 +124,6 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
         sigma_angle=sensor.sigma_angle,
         step=sensor.resolution,
         gap=2.0 * r if config.min_gap is None else config.min_gap,
-        slit=0.6 * r + 6.0 * sensor.sigma_range,
         nudge=0.12 * r,
         cover=0.16 * r + 3.0 * sensor.sigma_range,
         join=0.2 * r,
