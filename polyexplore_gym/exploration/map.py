@@ -20,7 +20,7 @@ from polyexplore_gym.exploration.scan_polygon import Scans
 from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
-VISIT = 8
+VISIT = 4
 """A measurement made for a jump edge in vain counts so much: an attempt that ended before its node counts one."""
 _AHEAD = 0.5
 """A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
@@ -70,7 +70,7 @@ class JumpEdges(NamedTuple):
     kind: np.ndarray
     """(c,) `scan_polygon` label of most of it."""
     visits: np.ndarray
-    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count an eighth."""
+    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count a quarter."""
     node: np.ndarray
     """(c, 3) position and heading of the node."""
     vertex: np.ndarray
