@@ -1,6 +1,6 @@
 """Where does the environment crash, hang or end too early? Random configurations and plans, each from one integer.
 
-    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--out results/fuzz]
+    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--largest 10000] [--out results/fuzz]
     python benchmarks/fuzz.py --case 17 [--picture x.png]
     python benchmarks/fuzz.py --scaled [--first 0] [--count 50]
 
@@ -321,7 +321,6 @@ def case_of(number: int) -> Case:
         "robot": {"radius": radius, "track": 1.324 * radius, "max_speed": 1.2 * size, "max_acceleration": 0.6 * size},
         "drive": {"mode": str(rng.choice(["kinematic", "kinematic", "physics"]))},
         "pose": {"mode": str(rng.choice(["exact"] * 7 + ["gaussian", "odometry", "slam"]))},
-        "mapping": {} if with_robot else {"min_length": 0.25, "door_width": 0.5},
         "exploration": {
             "placement": str(rng.choice(["in_front", "midpoint"])),
             "front_distance": None if with_robot else 1.0,
@@ -369,7 +368,7 @@ def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[
         return env, None, result
     found = exact.check(env)
     result |= {"seen": round(100.0 * found.share, 2), "left": round(found.area / found.limit, 3),
-               "drivable": round(found.drivable / found.limit, 3), "open edges": env.exploration.chains.count,
+               "drivable": round(found.drivable / found.limit, 3), "open edges": len(env.exploration.chains.id),
                "place": None if found.place is None else [round(float(v), 3) for v in found.place]}  # fmt: skip
     if outcome == "ended":
         result["kind"] = _verdict(env, found, decisions, result)
@@ -530,7 +529,7 @@ class Child:
     def play(self, number: int) -> dict[str, Any]:
         """The result of a case."""
         if self._process is None or self._process.poll() is not None:
-            self._errors = self._log.open("w", encoding="utf-8")
+            self._errors = self._log.open("a", encoding="utf-8")
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True
             )
@@ -544,9 +543,8 @@ class Child:
                 found: dict[str, Any] = json.loads(line[len(_MARK) :])
                 return found
         code = process.wait()
-        trace = [
-            line.strip() for line in self._log.read_text(encoding="utf-8").splitlines() if line.startswith("  File")
-        ]
+        said = self._log.read_text(encoding="utf-8").splitlines()[-40:]
+        trace = [*said[-1:], *(line.strip() for line in said if line.startswith("  File"))]
         kind = "hang" if code == -signal.SIGXCPU else "crash"
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         case: dict[str, Any] = {"case": number}
@@ -598,6 +596,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--cases", type=int, nargs="+", help="these instead, also those played already")
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after so many")
+    parser.add_argument("--largest", type=float, default=math.inf, help="leave out plans of more squares of the radius")
     parser.add_argument("--case", type=int, help="play this one here and print all about it")
     parser.add_argument("--picture", type=Path, help="of --case")
     parser.add_argument("--scaled", action="store_true", help="the same exploration in another size")
@@ -631,6 +630,8 @@ def _study(options: argparse.Namespace) -> None:
         for number in todo:
             if time.monotonic() - began > options.seconds:
                 break
+            if options.largest < math.inf and case_of(number).size > options.largest:
+                continue
             result = known[number] = child.play(number)
             out.write(json.dumps(result) + "\n")
             out.flush()

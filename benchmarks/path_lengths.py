@@ -180,7 +180,7 @@ class Tally:
 def compare(exploration: ExplorationMap, known: Any, tally: Tally, name: str) -> None:
     """Compare all path lengths of one state."""
     c, tol = exploration.chains, exploration.tol
-    if not c.count:
+    if not len(c.id):
         return
     if len(exploration._start) > 1:
         tally.contact += 1
@@ -194,7 +194,7 @@ def compare(exploration: ExplorationMap, known: Any, tally: Tally, name: str) ->
     discs = shapely.buffer(shapely.points(goals), tol.slack)
     upper = shortest(found.upper, list(shapely.intersection(discs, found.narrow)), start, goals, tol.radius)
     lower = shortest(found.lower, list(shapely.intersection(discs, found.wide)), start, goals, tol.radius)
-    for i in range(c.count):
+    for i in range(len(c.id)):
         at = f"({name}, jump edge {c.id[i]})"
         if unplaced[i]:
             stands = shapely.contains_xy(found.upper, *goals[i]) and np.isfinite(upper[i])

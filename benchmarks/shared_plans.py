@@ -5,9 +5,8 @@
 
 One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
 coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
-where it stood to measure and anywhere on the way (below 0: overlap; the engine lets a bump go some millimetres deep
-for one time step), and bumps a decision. `--noise` scales the laser's noise of range and angle. A run that was
-stopped goes on where it was with the same arguments.
+where it stood to measure and anywhere on the way (below 0: overlap), and bumps a decision. `--noise` scales the laser's
+noise of range and angle. A run that was stopped goes on where it was with the same arguments.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout.

@@ -9,10 +9,11 @@ wall met at any angle; a wall driven along, at a grazing angle; corners from out
 wider or narrower than the disc; and walls strewn at random. In every scene the robot drives five times, each time from
 where it stands: a quarter of these drives goes on as before, against what stopped it.
 
-One row a mode: drives that passed through a wall (the centre of the disc met one), the deepest overlap of disc and wall
-anywhere on the way and where the robot stood in the end, and the greatest jump: way between two poses beyond speed times
-step (physics) or the way of a drive beyond speed times its duration (kinematic). Overlaps and jumps in millionths of
-the radius; shapely measures them on the whole way, also between the poses. Exit code 1 if a wall did not hold.
+One row a mode: drives that passed through a wall (the centre of the disc met one), the deepest overlap of disc and
+wall anywhere on the way and where the robot stood in the end, and the greatest jump: way between two poses beyond speed
+times step (physics) or the way of a drive beyond speed times its duration (kinematic). Overlaps and jumps are in
+millionths of the radius; shapely measures them on the whole way, also between the poses. Exit code 1 if a wall did not
+hold.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -124,7 +125,6 @@ class Tally:
     jump: float = -math.inf
     longest: float = 0.0
     seconds: float = 0.0
-    worst: list[str] = field(default_factory=list)
 
     def add(self, world: World, lines: shapely.Geometry, result: DriveResult) -> None:
         robot, points = world.robot, result.trajectory[:, :2]
@@ -145,10 +145,10 @@ class Tally:
         self.jump = max(self.jump, jump / robot.radius)
         self.longest = max(self.longest, robot.max_speed * world.config.time_step / robot.radius)
 
-    def row(self) -> list[object]:
+    def row(self) -> list[str]:
         micro = [f"{1e6 * max(value, 0.0):.3f}" for value in (self.way, self.standing, self.jump)]
         spent = f"{1e3 * self.seconds / self.drives:.2f}"
-        return [self.drives, self.bumps, self.arrived, self.passed, *micro, f"{self.longest:.0f}", spent]
+        return [*map(str, (self.drives, self.bumps, self.arrived, self.passed)), *micro, f"{self.longest:.0f}", spent]
 
 
 def play(rng: np.random.Generator, scene: Callable[[np.random.Generator], Scene], mode: str, tally: Tally) -> None:

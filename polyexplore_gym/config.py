@@ -91,7 +91,7 @@ class RobotConfig:
     max_turn_acceleration: float = math.radians(300.0)
     """Largest angular acceleration, rad/s2."""
     mass: float = 9.0
-    """Mass, kg (data sheet)."""
+    """Mass, kg (data sheet). No motion depends on it: wheels do not slip, walls neither rub nor bounce."""
 
     def __post_init__(self) -> None:
         _check_types(self)
@@ -104,7 +104,7 @@ class DriveConfig:
     """How the robot gets to a node."""
 
     mode: Literal["physics", "kinematic"] = "physics"
-    """`physics`: pymunk, wheels and contact; `kinematic`: along the path, without dynamics, for training."""
+    """`physics`: wheels and contact with walls; `kinematic`: along the path, without dynamics, for training."""
     time_step: float = 0.04
     """Fixed step of the physics, s."""
     time_limit: float = 600.0

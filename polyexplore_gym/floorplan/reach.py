@@ -190,9 +190,9 @@ def keeps_most(areas: Sequence[float]) -> bool:
     return bool(areas[0] >= _GOOD * sum(areas))
 
 
-def last_true(holds: Callable[[int], bool]) -> int:
-    """The largest step from 1 to `STEPS` - 1 at which something holds that holds at all smaller ones; 0 if at none."""
-    low, high = 0, STEPS
+def last_true(holds: Callable[[int], bool], steps: int = STEPS) -> int:
+    """The largest step from 1 to `steps` - 1 at which something holds that holds at all smaller ones; 0 if at none."""
+    low, high = 0, steps
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if holds(middle) else (low, middle)

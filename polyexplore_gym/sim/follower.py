@@ -37,6 +37,8 @@ _LOOK_MIN, _LOOK_MAX, _LOOK_TIME = 0.32, 1.4, 0.3
 """Look-ahead, shortest and longest in radii, and the way driven in so many seconds between."""
 _LOOK_STEPS = 2.0
 """No nearer than so many steps: an error of heading then decays fastest; from one step on it would grow."""
+_STRAIGHT = 0.02
+"""Where the way turns by more than this (rad) a step is no longer than half the look-ahead, or half the turn."""
 _TURN_SHARE = 0.4
 _MARGIN, _BACKWARD = 0.9, 0.8
 """Shares of the acceleration limits planned with when braking, and between corners; the rest is for corrections."""
@@ -48,6 +50,9 @@ _AIM, _TURN_BACK = 0.12, 0.08
 does not stop to turn any more."""
 _BUMP = 0.08
 """A drive ends when a wall has taken this much of the commanded motion, radii (2 cm at 0.25 m)."""
+_STALL = 0.04
+"""Wheels that a wall holds turn on with what they reach from rest in this time (s) or in a step, if that is longer:
+a short step makes a bump no later."""
 _ROUNDING = 1e-9
 """Share of a motion; walls that take less have taken nothing."""
 
@@ -58,12 +63,13 @@ def _wrap(angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def vertex_speeds(path, limits, radius):  # type: ignore[no-untyped-def]
+def vertex_speeds(path, limits, radius, step):  # type: ignore[no-untyped-def]
     """Highest speed (k,) at each vertex of a path (k, 2): 0 at sharp corners and at the end.
 
     A corner of angle a turned over a length l is cut by about l a / 8 in its middle; turning by a takes at least
     2 sqrt(a / turn acceleration), and 2 a / turn rate. Hence l = 8 cut / a, no longer than the legs, and speed
-    l / time. A backward pass makes every later limit reachable by braking. limits as in `command`.
+    l / time, in two time steps at least. A backward pass makes every later limit reachable by braking. Arguments as in
+    `command`.
     """
     max_speed, max_rate, acceleration, turn_acceleration = limits
     n = path.shape[0]
@@ -86,6 +92,8 @@ def vertex_speeds(path, limits, radius):  # type: ignore[no-untyped-def]
                     max_speed,
                     length * min(0.5 * math.sqrt(_TURN_SHARE * turn_acceleration / turn), 0.5 * max_rate / turn),
                 )
+                if turn > _STRAIGHT:
+                    out[k] = min(out[k], length / (_LOOK_STEPS * step))
         out[k] = min(out[k], math.sqrt(out[k + 1] ** 2 + 2.0 * _BACKWARD * acceleration * ahead))
     return out
 
@@ -187,7 +195,7 @@ def command(state, path, speeds, heading, final_turn, limits, body, step):  # ty
         if curvature != 0.0:
             wish = min(wish, max_rate / abs(curvature))
         wish = min(wish, max_speed / (1.0 + 0.5 * track * abs(curvature)))
-        if abs(aside) > _CUT * radius:  # back to the leg in several steps
+        if abs(aside) > _CUT * radius or abs(off) > _STRAIGHT:  # back to the leg in several steps
             wish = min(wish, _LOOK_MAX * radius / (_LOOK_STEPS * step))
         # slow enough to turn towards the point before it is reached, as at the vertices
         wish = min(wish, 0.5 * look * math.sqrt(_TURN_SHARE * turn_acceleration / max(abs(off), 1e-6)))
@@ -210,7 +218,7 @@ def forget(state, progress):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _push(state, step, walls, radius, bends):  # type: ignore[no-untyped-def]
+def _push(state, acceleration, step, walls, radius, bends):  # type: ignore[no-untyped-def]
     """One step among walls in reach: they take what of the motion leads into them. Returns the number of bends."""
     x, y = state[X], state[Y]
     c, s = math.cos(state[HEADING]), math.sin(state[HEADING])
@@ -222,7 +230,7 @@ def _push(state, step, walls, radius, bends):  # type: ignore[no-untyped-def]
     if lost > _ROUNDING * moved:
         state[DEFICIT] += lost
         state[MET] = 1.0
-        state[SPEED] = max(0.0, progress / step)
+        state[SPEED] = max(progress / step, min(state[SPEED], acceleration * max(_STALL - step, 0.0)))
     forget(state, progress)
     return n
 
@@ -236,7 +244,7 @@ def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, 
     done); it ends early when the phase is `DONE` or later, when the trajectory is full, and before a step that might
     leave the box.
     """
-    radius, _track = body
+    radius = body[0]
     bends = np.empty((BENDS, 2))
     clear = 0.0  # at least so far to the nearest wall
     row = 0
@@ -262,7 +270,7 @@ def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, 
             forget(state, moved)
             clear -= moved
         else:
-            n = _push(state, step, walls, radius, bends)
+            n = _push(state, limits[2], step, walls, radius, bends)
             clear = 0.0
         for k in range(n):
             trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = bends[k, 0], bends[k, 1], state[HEADING]

@@ -18,11 +18,13 @@ from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.errors import InvalidMotionError
 
 ON_LINE = 1e-9
-"""Closer than this (m) to a wall's line the wall is seen edge-on, and to the wall itself the sensor stands on it."""
+"""Closer than this (m) to a wall's line the wall is seen edge-on, and to the wall itself the sensor stands on it.
+Rounding of coordinates in metres; it follows from no robot."""
 END_TOLERANCE = 1e-12
-"""A ray that passes this close (m) to the end of a wall hits it."""
+"""A ray that passes this close (m) to the end of a wall hits it. Rounding, as above."""
 MIN_RANGE = 1e-3
-"""Smallest noisy reading, m: noise never makes a range zero or negative."""
+"""Smallest noisy reading, m: noise never makes a range zero or negative. The last digit that drivers report, whatever
+the sensor; the robot's body keeps true ranges above it."""
 _BEARING_ERROR = 2e-5
 _TWO_PI = 2.0 * math.pi
 

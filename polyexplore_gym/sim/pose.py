@@ -16,7 +16,8 @@ from polyexplore_gym.errors import InvalidMotionError
 
 _STEP_LENGTH = 0.1
 _STEP_TURN = 0.1
-"""odometry: longer motions are cut into pieces of at most this (m, rad), so that heading drift bends the way."""
+"""odometry: longer motions are cut into pieces of at most this (m, rad), so that heading drift bends the way. The
+length does not follow from the robot: drift is given per metre, whoever drives it."""
 
 
 def wrap(angle: float) -> float:

@@ -158,10 +158,10 @@ def _touching(segments, x, y, radius):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _into_none(touched, dx, dy, depth):  # type: ignore[no-untyped-def]
     """Whether a motion leads into none of the walls touched, or no deeper."""
-    for i in range(touched.shape[0]):  # noqa: SIM110  (a kernel)
-        if dx * touched[i, 1] + dy * touched[i, 2] < -depth:
-            return False
-    return True
+    deepest = 0.0
+    for i in range(touched.shape[0]):
+        deepest = max(deepest, -(dx * touched[i, 1] + dy * touched[i, 2]))
+    return deepest <= depth
 
 
 @njit(cache=True)

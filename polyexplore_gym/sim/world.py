@@ -33,7 +33,8 @@ class DriveResult:
     """What a drive did."""
 
     trajectory: np.ndarray
-    """(m, 3) true poses along the way, the first the start; m >= 1."""
+    """(m, 3) true poses along the way, the first the start: at every vertex (kinematic), or after every time step and
+    where walls bend the way (physics); m >= 1. The centre moves straight from one to the next."""
     distance: float
     """Way travelled by the centre of the body, m."""
     duration: float
@@ -160,7 +161,7 @@ class World:
         state = np.zeros(9)
         state[:3] = self._pose
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
-        speeds = follower.vertex_speeds(path, self._limits, robot.radius)
+        speeds = follower.vertex_speeds(path, self._limits, robot.radius, step)
         steps = max(1, math.ceil(self.config.time_limit / step))
         parts, done = [self._pose[None]], 0
         while done < steps and state[follower.PHASE] < follower.DONE:

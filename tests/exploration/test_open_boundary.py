@@ -7,6 +7,7 @@ gap and has floor behind it must be covered by a jump edge, and no jump edge may
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,7 @@ from exploration_scenes import scene
 from baselines.oracle.sight import visibility_ring
 from polyexplore_gym.config import ExplorationConfig, MappingConfig, SensorConfig
 from polyexplore_gym.exploration import ExplorationMap, shapes
-from polyexplore_gym.floorplan import FloorPlan, generate
+from polyexplore_gym.floorplan import generate
 from polyexplore_gym.mapping import LineMap, extract_lines
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.laser import Laser
@@ -67,8 +68,7 @@ def floor_of(family: str, seed: int, walls: np.ndarray) -> Any:
     lines = shapely.multilinestrings(walls.reshape(-1, 2, 2))
     parts = shapely.get_parts(shapely.polygonize([shapely.node(lines)]))
     if family == "furnished":  # what is inside a box is no floor
-        outer = max(parts, key=lambda p: shapely.Polygon(p.exterior).area)
-        return outer
+        return max(parts, key=lambda p: shapely.Polygon(p.exterior).area)
     return shapely.union_all([p for p in parts if p.area > 1.0])
 
 
@@ -186,7 +186,7 @@ def uncovered(t: Twin) -> list[tuple[float, list[float]]]:
     for line in openings(t):
         points = along(line, 0.2 * RADIUS)
         near = shapely.distance(edges, shapely.points(points)) <= tolerance(t, points)
-        share = float(np.mean(near)) if t.exploration.chains.count else 0.0
+        share = float(np.mean(near)) if len(t.exploration.chains.id) else 0.0
         if share < 0.7:
             found.append((round(share, 2), np.round(points[len(points) // 2], 2).tolist()))
     return found
@@ -203,7 +203,7 @@ def unsampled(t: Twin) -> Any:
         on_it = np.abs((t.returns - a) @ np.array([-u[1], u[0]])) < 1e-6
         at = np.sort(along_it[on_it & (along_it > -1e-6) & (along_it < length + 1e-6)])
         at = np.concatenate(([0.0], at, [length]))
-        for low, high in zip(at[:-1], at[1:], strict=True):
+        for low, high in itertools.pairwise(at):
             if high - low > 0.5 * t.exploration.tol.gap:
                 found.append([a + low * u, a + high * u])
     return shapely.multilinestrings(found)
@@ -227,3 +227,45 @@ def groundless(t: Twin) -> list[tuple[float, list[float]]]:
         if share < 0.5:
             found.append((round(share, 2), np.round(points[len(points) // 2], 2).tolist()))
     return found
+
+
+KNOWN: dict[str, tuple[str, ...]] = {
+    "half": ("angled-9", "office-3", "office-11"),
+    "full": ("furnished-9", "furnished-11", "home-11", "office-10"),
+    "short": ("home-8", "angled-8", "office-11"),
+    "narrow": ("furnished-3", "furnished-7", "office-8"),
+    "sparse": ("thick rooms-8", "furnished-2", "furnished-4", "furnished-9", "home-6", "home-10", "angled-6",
+               "office-9"),
+    "far": ("thick rooms-9", "furnished-9", "angled-5", "office-9", "office-10"),
+}  # fmt: skip
+"""Scenes that fail: jump edges with nothing behind them, most of them little rings of open edges in seen space."""
+
+
+def cases(families: tuple[str, ...], seeds: range) -> list[Any]:
+    found = []
+    for name, family, seed in itertools.product(SENSORS, families, seeds):
+        known = f"{family}-{seed}" in KNOWN[name]
+        marks = [pytest.mark.xfail(strict=False, reason="a jump edge without ground")] if known else []
+        noise = float((list(SENSORS).index(name) + FAMILIES.index(family) + seed) % 2)
+        found.append(pytest.param(name, family, seed, noise, marks=marks))
+    return found
+
+
+def check(name: str, family: str, seed: int, noise: float) -> None:
+    t = twin(family, SENSORS[name], seed, noise)
+    assert len(t.hidden)
+    assert uncovered(t) == []
+    assert groundless(t) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "family", "seed", "noise"), cases(("rooms", "thick rooms", "furnished", "angled"), range(1))
+)
+def test_the_open_boundary_is_that_of_what_was_seen(name, family, seed, noise):
+    check(name, family, seed, noise)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "family", "seed", "noise"), cases(FAMILIES, range(1, 12)))
+def test_the_open_boundary_of_many_scenes(name, family, seed, noise):
+    check(name, family, seed, noise)

@@ -50,6 +50,18 @@ def test_scans_and_both_poses_are_read(tmp_path, kind):
     assert log.beam_times[3][-1] == pytest.approx(5e-4 * (BEAMS - 1))
 
 
+@pytest.mark.parametrize(
+    ("kind", "compression"),
+    [("bag", "BZ2"), ("bag", "LZ4"), ("db3", "FILE"), ("db3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE")],
+)
+def test_compressed_bags(tmp_path, kind, compression):
+    path = drive(tmp_path / "a", kind, scans=3, compression=compression)
+    whole = read_log(drive(tmp_path / "b", kind, scans=3))
+    log = read_log(path)
+    np.testing.assert_array_equal(log.ranges, whole.ranges)
+    np.testing.assert_allclose(log.poses, whole.poses, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_scans_taken_on_the_move_are_straightened(tmp_path, kind):
     log = read_log(drive(tmp_path / "a", kind))
@@ -158,6 +170,34 @@ def test_without_a_frame_called_odom_the_poses_are_of_unknown_origin(tmp_path):
     assert_poses(log.poses, laser(0.1 * np.arange(30)))
 
 
+def test_odometry_beside_a_pose_from_tf(tmp_path):
+    with Bag(tmp_path / "a", "bag") as bag:
+        bag.tf(0, bag.transform(0, "base_link", "laser", MOUNT), topic="/tf_static")
+        for time in np.arange(0, 3, 0.1):
+            bag.tf(time, bag.transform(time, "map", "base_link", robot(time)))
+            bag.odometry(time, odometry(time))
+            bag.scan(time, measured(time))
+    log = read_log(bag.path)
+    assert_poses(log.poses, laser(0.1 * np.arange(30)))
+    assert_poses(log.odometry, compose(odometry(0.1 * np.arange(30)), MOUNT))
+    assert_poses(log.track.poses, log.odometry)
+
+
+def test_a_mounting_that_is_published_again_and_again_and_a_robot_that_stands_still(tmp_path):
+    for moving in (True, False):
+        with Bag(tmp_path / str(moving), "mcap") as bag:
+            for time in np.arange(0, 3, 0.1):
+                if 1.0 < time < 2.0:
+                    bag.tf(time, bag.transform(time, "base_link", "laser", MOUNT))
+                bag.tf(time, bag.transform(time, "odom", "base_link", odometry(time if moving else 0.0)))
+                bag.scan(time, measured(time))
+        log = read_log(bag.path)
+        assert len(log) == 30
+        assert log.poses_are == "odometry"
+        np.testing.assert_allclose(log.mount, MOUNT, atol=1e-6)
+        assert_poses(log.poses, compose(odometry((0.1 if moving else 0.0) * np.arange(30)), MOUNT))
+
+
 def test_scans_without_a_transform_at_their_time_are_left_out(tmp_path):
     with Bag(tmp_path / "a", "bag") as bag:
         bag.tf(0, bag.transform(0, "base_link", "laser", MOUNT), topic="/tf_static")
@@ -170,7 +210,28 @@ def test_scans_without_a_transform_at_their_time_are_left_out(tmp_path):
     away = (log.times - START > 2.0) & (log.times - START < 4.0)
     assert not away.any()
     assert len(log) + len(log.broken) == 60
+    with Bag(tmp_path / "b", "bag") as bag:
+        for time in np.arange(0, 3, 0.1):
+            bag.tf(time, bag.transform(time, "odom", "laser", odometry(time)))
+            bag.scan(time, measured(time), stamp=100 + time)
+    with pytest.raises(
+        InvalidLogError, match=r"topic /scan: /tf has no pose of laser at the time of any scan, from 17"
+    ):
+        read_log(bag.path)
+    log = read_log(tmp_path / "a.bag")
     assert_poses(log.poses, compose(odometry(log.times - START), MOUNT))
+
+
+def test_a_frame_of_two_parents_is_told_of(tmp_path):
+    with Bag(tmp_path / "a", "mcap") as bag:
+        bag.tf(0, bag.transform(0, "base_link", "laser", MOUNT), topic="/tf_static")
+        for time in np.arange(0, 1, 0.1):
+            bag.tf(time, bag.transform(time, "odom", "base_link", odometry(time)))
+            bag.tf(time, bag.transform(time, "other", "base_link", (0, 0, 0)))
+            bag.scan(time, measured(time))
+    log = read_log(bag.path)
+    assert log.notes == ("/tf gives base_link several parents: odom is used",)
+    assert_poses(log.poses, compose(odometry(0.1 * np.arange(10)), MOUNT))
 
 
 def test_the_topic_is_found_or_named(tmp_path):

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
+from polyexplore_gym.config import RobotConfig
+
 
 def random_walls(rng: np.random.Generator, count: int, side: float = 14.0) -> np.ndarray:
     """Free-standing walls (count, 4) strewn over a square: every third axis-parallel, now and then two joined."""
@@ -33,6 +35,24 @@ def clear_point(rng: np.random.Generator, walls: np.ndarray, half: float, radius
         point = rng.uniform(-half, half, 2)
         if shapely.distance(lines, shapely.points(point)) > radius:
             return point
+
+
+def any_robot(rng: np.random.Generator) -> tuple[RobotConfig, float]:
+    """A robot anywhere in the legal range, and a time step (s): it covers 0.0001 to 300 radii in one."""
+
+    def draw(low: float, high: float) -> float:
+        return float(low * (high / low) ** rng.uniform())
+
+    radius, rate, speed, step = draw(0.02, 2.0), draw(0.3, 30.0), draw(0.05, 50.0), draw(0.001, 0.2)
+    robot = RobotConfig(
+        radius=radius,
+        track=radius * rng.uniform(0.5, 2.0),
+        max_speed=speed,
+        max_acceleration=speed * draw(0.2, 200.0),
+        max_turn_rate=rate,
+        max_turn_acceleration=rate * draw(0.5, 200.0),
+    )
+    return robot, step
 
 
 def lines_of(walls: np.ndarray) -> shapely.Geometry:

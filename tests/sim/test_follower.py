@@ -4,6 +4,7 @@ import numpy as np
 import pymunk
 import pytest
 import shapely
+from sim_scenes import any_robot, boxed
 
 from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
 from polyexplore_gym.sim import follower
@@ -57,9 +58,9 @@ def test_free_motion_is_what_pymunk_integrates() -> None:
     robot, step = RobotConfig(), 0.04
     limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
     path = np.array([[0.0, 0.0], [2.0, 0.3], [2.5, 1.5], [1.0, 3.0]])
-    speeds = follower.vertex_speeds(path, limits, robot.radius)
+    speeds = follower.vertex_speeds(path, limits, robot.radius, step)
     space = pymunk.Space()
-    body = pymunk.Body(robot.mass, 1.0)
+    body = pymunk.Body(1.0, 1.0)
     space.add(body, pymunk.Circle(body, robot.radius))
     state = np.zeros(9)
     state[follower.PHASE] = follower.ALIGN
@@ -80,11 +81,61 @@ def test_free_motion_is_what_pymunk_integrates() -> None:
     np.testing.assert_allclose(wrapped(way[1:, 2] - np.array(rows)[:, 2]), 0.0, atol=1e-9)
 
 
+def test_keeps_to_the_path_whatever_the_robot() -> None:
+    rng, coarse = np.random.default_rng(6), 0
+    for _ in range(150):
+        robot, step = any_robot(rng)
+        path, heading = random_path(rng, 0.5 * robot.radius, 16.0 * robot.radius), rng.uniform(-3, 3)
+        pose = np.array([0.0, 0.0, rng.uniform(-3, 3)])
+        world = World(NO_WALLS, robot, SensorConfig(), DriveConfig(time_step=step, time_limit=7200.0), pose)
+        result = world.drive(path, heading)
+        assert not result.collided
+        assert result.contact is None
+        reach = robot.max_speed * step / robot.radius  # radii in a step
+        coarse += reach > 1.0
+        assert result.arrived or reach > 100.0
+        some = result.trajectory[:: 1 + len(result.trajectory) // 2000, :2]
+        off = shapely.distance(shapely.LineString(path), shapely.points(some)).max()
+        assert off < 0.7 * robot.radius
+    assert coarse > 20
+
+
+def test_ends_before_it_leaves_the_box_of_known_walls() -> None:
+    robot, step = RobotConfig(), 0.04
+    limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
+    path = np.array([[0.0, 0.0], [9.0, 0.0]])
+    walls = boxed(NO_WALLS, 30.0)
+    state, rows, done = np.zeros(9), [], 0
+    for edge in (3.0, 6.0, 12.0):
+        part = np.empty((2048, 3))
+        filled, count = follower.follow(
+            state,
+            path,
+            follower.vertex_speeds(path, limits, robot.radius, step),
+            1.0,
+            True,
+            limits,
+            (robot.radius, robot.track),
+            step,
+            10_000 - done,
+            walls,
+            (-3.0, -3.0, edge, 3.0),
+            part,
+        )
+        assert part[:filled, 0].max() + robot.radius < edge
+        assert (state[follower.PHASE] == follower.DONE) == (edge == 12.0)
+        rows.append(part[:filled])
+        done += count
+    whole = World(walls, robot, SensorConfig(), DriveConfig(), np.zeros(3)).drive(path, 1.0)
+    np.testing.assert_allclose(np.concatenate(rows)[:, :2], whole.trajectory[1:, :2])
+    assert done == len(whole.trajectory) - 1
+
+
 def test_vertex_speeds_leave_room_to_brake() -> None:
     rng = np.random.default_rng(8)
     for _ in range(100):
         path = random_path(rng, 0.05, 3.0)
-        speeds = follower.vertex_speeds(path, (1.2, 3.0, 0.6, 5.0), 0.25)
+        speeds = follower.vertex_speeds(path, (1.2, 3.0, 0.6, 5.0), 0.25, 0.04)
         legs = np.hypot(*np.diff(path, axis=0).T)
         turns = np.abs(wrapped(np.diff(np.arctan2(*np.diff(path, axis=0).T[::-1]))))
         assert speeds[-1] == 0.0

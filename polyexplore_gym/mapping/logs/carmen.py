@@ -39,14 +39,16 @@ GIVE_UP = 10_000
 """So many broken lines before the first scan, and the file is no log."""
 CODES = 80.0
 """SICK lasers write error codes as ranges of 81.83 m and more; their range ends at 80 m."""
+SICK = 90, 180, 360, 720
+"""Beams of lasers with a field of view of 180 degrees, one more or less."""
 ROUNDING = 1e-6
 """Angular resolutions are written with six decimals, rad."""
 MOUNTS = {"robot_frontlaser_offset": 0, "robot_frontlaser_side_offset": 1, "robot_frontlaser_angular_offset": 2}
 """Parameters of where the laser sits on the robot, and the component of the pose that each is."""
 SAME = 0.02, math.radians(1.0)
 """Poses that differ by no more tell of one trajectory, m and rad."""
-MOVED = 0.1
-"""A robot that went less than that has not moved, m."""
+MOVED = 0.1, 0.1
+"""A robot that went and turned less than that has not moved, m and rad."""
 _NAME = re.compile(r"[A-Z][A-Z0-9_]*$")
 
 
@@ -124,6 +126,7 @@ def read_carmen(
         broken=tuple(Broken(f"line {line}", reason) for line, reason in sorted(found.broken)),
         unread={name: count for name, count in total.items() if name != message},
         read=message,
+        notes=_notes(kept[0].beams, field_of_view),
     )
 
 
@@ -270,6 +273,13 @@ def _flaser(behind: int, count: int, field_of_view: float | None) -> _Beams:
     return _Beams("FLASER", behind, count, start, step, None)
 
 
+def _notes(beams: _Beams, field_of_view: float | None) -> tuple[str, ...]:
+    """What is guessed of the beams."""
+    if beams.message != "FLASER" or field_of_view is not None or min(abs(beams.size - n) for n in SICK) <= 1:
+        return ()
+    return (f"FLASER does not say how its {beams.size} beams lie: a field of view of 180 degrees is assumed",)
+
+
 def _laser(message: str, behind: int, count: int, settings: np.ndarray) -> _Beams:
     start, view, step, max_range = (float(value) for value in settings[1:5])
     exact = min((view / (count - 1), view / count), key=lambda exact: abs(exact - step))
@@ -326,7 +336,7 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
 
     laser, robot = np.array([scan.pose[:3] for scan in scans]), np.array([scan.pose[3:] for scan in scans])
     of_robot = "odom_x odom_y odom_theta" if message == "FLASER" else "robot_x robot_y robot_theta"
-    told = bool((np.abs(robot) <= FARTHEST).all()) and (_way(robot) > MOVED or _way(laser) <= MOVED)
+    told = bool((np.abs(robot) <= FARTHEST).all()) and (_moves(robot) or not _moves(laser))
     if told:
         fixed = _constant(between(robot, laser))
         if fixed is None:
@@ -358,9 +368,10 @@ def _times(stamps: np.ndarray) -> np.ndarray | None:
     return stamps if sound else None
 
 
-def _way(poses: np.ndarray) -> float:
-    """How far poses lie from the first one at most, m."""
-    return float(np.hypot(*(poses[:, :2] - poses[0, :2]).T).max())
+def _moves(poses: np.ndarray) -> bool:
+    """Whether the poses (n, 3) differ."""
+    off = between(poses[0], poses)
+    return bool((np.hypot(off[:, 0], off[:, 1]) > MOVED[0]).any() or (np.abs(off[:, 2]) > MOVED[1]).any())
 
 
 def _constant(seen: np.ndarray) -> np.ndarray | None:

@@ -24,9 +24,10 @@ import numpy as np
 from polyexplore_gym.errors import InvalidLogError, MissingDependencyError
 from polyexplore_gym.mapping.extract import LEAST_RANGE, increasing
 from polyexplore_gym.mapping.logs.npz import LONGEST
+from polyexplore_gym.mapping.logs.poses import compose
 from polyexplore_gym.mapping.logs.record import LEAST_BEAMS, LONGEST_RANGE, MOST_BEAMS, WIDEST, Broken, LaserLog, Track
 from polyexplore_gym.mapping.logs.tf import Frames
-from polyexplore_gym.mapping.logs.trajectory import chosen
+from polyexplore_gym.mapping.logs.trajectory import chosen, covered
 
 BAG, MCAP, SQLITE = b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"
 """How the files begin."""
@@ -317,7 +318,10 @@ def _log(found: _Found) -> LaserLog:
     if where.known.all():
         return log
     if not where.known.any():
-        raise InvalidLogError(f"topic {found.topic}: /tf has no pose of {frame} at the time of any scan")
+        raise InvalidLogError(
+            f"topic {found.topic}: /tf has no pose of {frame} at the time of any scan, from {times.min():.3f} to "
+            f"{times.max():.3f} s"
+        )
     missing = [
         Broken(scan.where, f"/tf has no pose of {frame} at {time:.3f} s")
         for scan, time, known in zip(scans, times.tolist(), where.known, strict=True)
@@ -347,9 +351,10 @@ def _where(found: _Found, frame: str, times: np.ndarray) -> _Where:
     out = _Where(known=np.ones(times.size, bool))
     topic = _join_odometry(found, frame)
     chain = frames.above(frame)
-    fixed = 0
-    while fixed + 1 < len(chain) and not frames.edges[chain[fixed]].moves():
-        fixed += 1
+    for name in chain:
+        if frames.others[name]:
+            found.notes[f"/tf gives {name} several parents: {frames.edges[name].parent} is used"] = None
+    fixed = frames.lowest(chain)
     out.mount, out.upside_down = frames.pose(chain[: fixed + 1], np.zeros(1))
     out.mount = out.mount[0]
     if fixed + 1 == len(chain):
@@ -366,6 +371,7 @@ def _where(found: _Found, frame: str, times: np.ndarray) -> _Where:
     source = topic or "/tf"
     if odom is None:
         out.why = f"{source} gives {frame} in the frame {root}, which is not called odom"
+        _beside(found, chain, times, out)
         return out
     below = chain[: odom + 1]
     out.odometry, _ = frames.pose(below, times)
@@ -380,11 +386,23 @@ def _where(found: _Found, frame: str, times: np.ndarray) -> _Where:
     return out
 
 
+def _beside(found: _Found, chain: list[str], times: np.ndarray, out: _Where) -> None:
+    """Add the odometry of nav_msgs/Odometry where /tf gives the robot's pose without it."""
+    for topic in sorted(found.odometry, key=lambda name: (-found.counts[name], len(name), name)):
+        for child, edge in found.odometry[topic].edges.items():
+            track = edge.plane()
+            if child in chain and track.times.size > 1 and covered(track, times[out.known]).all():
+                at, _ = found.frames.pose(chain[: chain.index(child) + 1], np.zeros(1))
+                out.odometry = compose(track.at(times), at[0])
+                out.track = Track(track.times, compose(track.poses, at[0]))
+                return
+
+
 def _join_odometry(found: _Found, frame: str) -> str:
     """Take nav_msgs/Odometry for what /tf does not tell of the robot's way; returns the topic used."""
     frames = found.frames
     chain = frames.above(frame)
-    if any(frames.edges[name].moves() for name in chain[:-1]) or not found.odometry:
+    if frames.lowest(chain) + 1 < len(chain) or not found.odometry:
         return ""
     topic = min(found.odometry, key=lambda name: (-found.counts[name], len(name), name))
     for child, edge in found.odometry[topic].edges.items():

@@ -32,6 +32,8 @@ class Edge:
     times: list[float] = field(default_factory=list)
     values: list[tuple[float, ...]] = field(default_factory=list)
     """x, y, z, qx, qy, qz, qw."""
+    changes: bool | None = None
+    """Worked out when it is asked for, and all are there."""
 
     def sorted(self) -> tuple[np.ndarray, np.ndarray]:
         """Times (m,), increasing, and transforms (m, 7) whose quaternions do not change sign."""
@@ -49,11 +51,11 @@ class Edge:
 
     def moves(self) -> bool:
         """Whether the transform changes at all."""
-        if self.fixed:
-            return False
-        poses = self.plane().poses
-        off = between(poses[0], poses)
-        return bool((np.hypot(off[:, 0], off[:, 1]) > SAME[0]).any() or (np.abs(off[:, 2]) > SAME[1]).any())
+        if self.changes is None:
+            poses = self.plane().poses
+            off = between(poses[0], poses)
+            self.changes = bool((np.hypot(off[:, 0], off[:, 1]) > SAME[0]).any() or (np.abs(off[:, 2]) > SAME[1]).any())
+        return self.changes and not self.fixed
 
 
 class Frames:
@@ -91,11 +93,21 @@ class Frames:
                 raise InvalidLogError(f"/tf: the frames above {frame} run in a circle: {', '.join(chain[:5])} ...")
         return chain
 
+    def lowest(self, chain: list[str]) -> int:
+        """Number of the edge, up a chain, above which the robot moves; where it never does, that below odometry.
+
+        The length of the chain less one if there is none.
+        """
+        edges = [self.edges[name] for name in chain[:-1]]
+        moving = [k for k, edge in enumerate(edges) if edge.moves()]
+        told = [k for k, edge in enumerate(edges) if not edge.fixed and "odom" in edge.parent.lower()]
+        return (moving or told or [len(edges)])[0]
+
     def known(self, chain: list[str], times: np.ndarray) -> np.ndarray:
         """(n,) whether the transforms up a chain are told at these times (n,)."""
         sound = np.ones(times.size, bool)
         for frame in chain[:-1]:
-            if not self.edges[frame].fixed:
+            if self.edges[frame].moves():
                 sound &= covered(self.edges[frame].plane(), times)
         return sound
 
