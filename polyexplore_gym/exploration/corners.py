@@ -232,8 +232,10 @@ def corner_vertices(ends, walls, scans, waited, since, tol):
             y = ey + away * uy
             limit = math.sin(half) + _LEEWAY
             kept = True
-            if clearance(x, y, walls, tol.reach) < tol.stand:
-                narrow = True
+            room = clearance(x, y, walls, tol.reach)
+            # Something else is nearer than the wall end: from one side of a passage to the other no leg need be free.
+            narrow |= room < rho
+            if room < tol.stand:
                 away, room = _in_narrows(ex, ey, ux, uy, walls, tol)
                 x = ex + away * ux
                 y = ey + away * uy
