@@ -217,7 +217,8 @@ class Linemap:
     log: tyro.conf.Positional[Path]
     """The log."""
     out: tuple[Path, ...] = (Path("results/linemap"),)
-    """Files to write, .json, .geojson, .svg or .png, or folders, which get one of each, named after the log."""
+    """Files to write, .json, .geojson, .svg, .png or .yaml (for ROS map_server, with a .pgm), or folders, which get
+    one of each, named after the log."""
     max_range: float | None = None
     """Range from which on a beam has no return, m (default: what the log says, else 30)."""
     sigma_range: float = 0.01

@@ -206,6 +206,53 @@ def test_one_plan_is_explored_and_filmed(folder, tmp_path, capsys):
         assert picture.size[0] == 240
 
 
+def test_a_plan_is_read_and_written(tmp_path, capsys):
+    drawn = [
+        [0, 0],
+        [600, 0],
+        [600, 200],
+        [620, 200],
+        [620, 0],
+        [900, 0],
+        [900, 400],
+        [620, 400],
+        [620, 250],
+        [600, 250],
+    ]
+    (tmp_path / "a.json").write_text(json.dumps({"exterior": [*drawn, [600, 400], [0, 400]]}))
+    out = [str(tmp_path / name) for name in ("b.json", "b.yaml", "b.geojson")]
+    assert main(["plan", str(tmp_path / "a.json"), "--units", "cm", "--radius", "0.2", "--out", *out]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert "a: 35.3 m2, 9.00 x 4.00 m, 12 vertices, 0 holes" in captured.out
+    assert (tmp_path / "b.pgm").exists()
+    assert main(["plan", str(tmp_path / "b.yaml"), "--radius", "0.3", "--start", "8", "1"]) == 0
+    captured = capsys.readouterr()
+    assert "warning: " in captured.err
+    assert "reaches 32 % of the floor" in captured.err
+    assert captured.out.startswith("b: 11.")
+    assert main(["plan", str(tmp_path / "b.json"), "--radius", "0.3", "--strict"]) == 2
+    assert "strict: nothing may be left out" in capsys.readouterr().err
+    assert main(["plan", str(tmp_path / "b.json"), "--out", str(tmp_path / "b.bmp")]) == 2
+    assert "the name must end in" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["plan", str(tmp_path / "b.json"), "--snap", "nan"])
+    assert "snap = nan: must be a finite number of metres" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_robot_of_the_configuration_decides_what_is_kept(tmp_path, capsys):
+    ring = [[0, 0], [6, 0], [6, 2], [6.2, 2], [6.2, 0], [9, 0], [9, 4], [6.2, 4], [6.2, 2.5], [6, 2.5], [6, 4], [0, 4]]
+    save_plan(FloorPlan.create(ring, name="a"), tmp_path / "a.json")
+    (tmp_path / "big.json").write_text(json.dumps({"robot": {"radius": 0.3}, "drive": {"mode": "kinematic"}}))
+    run = ["run", str(tmp_path / "a.json"), "--config", str(tmp_path / "big.json")]
+    assert main(run) == 0
+    captured = capsys.readouterr()
+    assert "a (24 m2)" in captured.out
+    assert "reaches 68 % of the floor" in captured.err
+    assert main([*run, "--start", "8", "1", "0"]) == 0
+    assert "a (11 m2)" in capsys.readouterr().out
+
+
 def carmen(path: Path, *junk: str) -> Path:
     """A log of a laser that turns in the middle of a square room of 4 m, with broken lines at its end."""
     angles = np.radians(np.arange(-90, 91))
@@ -221,7 +268,8 @@ def test_a_log_becomes_a_map(tmp_path, capsys):
     log, out = carmen(tmp_path / "room.log", "FLASER 181 1.0 2.0", "1 2 3"), tmp_path / "maps"
     assert main(["linemap", str(log), "--out", str(out), str(tmp_path / "b.json")]) == 0
     captured = capsys.readouterr()
-    assert sorted(path.name for path in out.iterdir()) == ["room.geojson", "room.json", "room.png", "room.svg"]
+    suffixes = ("geojson", "json", "pgm", "png", "svg", "yaml")
+    assert sorted(path.name for path in out.iterdir()) == [f"room.{suffix}" for suffix in suffixes]
     assert (out / "room.json").read_bytes() == (tmp_path / "b.json").read_bytes()
     assert "left out: line 9: 4 fields do not fit a FLASER message of 181 ranges" in captured.err
     assert "left out: line 10: not a CARMEN message" in captured.err

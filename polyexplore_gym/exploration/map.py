@@ -339,9 +339,12 @@ class ExplorationMap:
         if self._tight is not None:
             self._tight_touched.append(touched)
         self._plan(pose)
-        while not self.reachable.any() and self.chains.size and not self._squeeze(pose, walls, alive):
+        while not self.reachable.any():
+            if self.chains.size and self._squeeze(pose, walls, alive):
+                break
+            again = self._look_again()
             self._switch(self._wide)
-            if not self._look_again():
+            if not again:
                 self._plan(pose)
                 break
             self._show(self._wide, walls, alive, touched[:0], _EVERYWHERE)

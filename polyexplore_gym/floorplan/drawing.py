@@ -16,8 +16,9 @@ deeper by the wall's thickness unless the symbol is itself a closed rectangle.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,9 @@ import shapely.affinity
 import shapely.ops
 
 from polyexplore_gym.config import PlanFileConfig
-from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
 from polyexplore_gym.floorplan.model import FloorPlan, polygons
-from polyexplore_gym.floorplan.units import guess
+from polyexplore_gym.floorplan.units import guess, offset, offset_text
 from polyexplore_gym.floorplan.validation import MAX_COORDINATE, MAX_EXTENT, to_array
 
 MAX_STROKES = 100_000
@@ -87,8 +88,12 @@ def load_drawing(path: Path, options: PlanFileConfig) -> tuple[list[shapely.Poly
         from polyexplore_gym.floorplan import svg
 
         drawing = svg.read(path, options.units, options.tolerance or CURVE_TOLERANCE)
-    rooms = rooms_of(drawing, options)
-    return rooms, {"format": path.suffix[1:].upper()}
+    drawing, taken = _near(drawing)
+    meta: dict[str, Any] = {"format": path.suffix[1:].upper()}
+    if taken.any():
+        warnings.warn(f"{path}: {offset_text(taken)}", FloorPlanWarning, stacklevel=4)
+        meta["offset"] = taken.tolist()
+    return rooms_of(drawing, options), meta
 
 
 def save_drawing(plan: FloorPlan, path: Path) -> None:
@@ -101,6 +106,19 @@ def save_drawing(plan: FloorPlan, path: Path) -> None:
         from polyexplore_gym.floorplan import svg
 
         svg.write(plan, path)
+
+
+def _near(drawing: Drawing) -> tuple[Drawing, np.ndarray]:
+    """The drawing near the origin, and what was taken off its coordinates (2,), m."""
+    if not drawing.strokes:
+        return drawing, np.zeros(2)
+    points = to_array(np.concatenate([stroke.points for stroke in drawing.strokes]), "the drawing")
+    taken = offset(points.min(axis=0), points.max(axis=0))
+    if not taken.any():
+        return drawing, taken
+    return replace(
+        drawing, strokes=[replace(stroke, points=stroke.points - taken) for stroke in drawing.strokes]
+    ), taken
 
 
 def rooms_of(drawing: Drawing, options: PlanFileConfig) -> list[shapely.Polygon]:

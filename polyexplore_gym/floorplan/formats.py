@@ -22,7 +22,7 @@ from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
 from polyexplore_gym.floorplan import geojson
 from polyexplore_gym.floorplan.model import FloorPlan
 from polyexplore_gym.floorplan.reach import tell, trim
-from polyexplore_gym.floorplan.units import LARGE_AREA, guess, metres
+from polyexplore_gym.floorplan.units import LARGE_AREA, guess, metres, offset_text
 from polyexplore_gym.floorplan.validation import check_keys, shorten, to_array
 
 MAX_FILE_BYTES = 64 * 1024 * 1024
@@ -117,13 +117,17 @@ def _load(path: Path, start: Sequence[float] | None, radius: float | None, optio
     elif isinstance(data.get("type"), str) and data["type"] in geojson.TYPES:
         floor = geojson.read(data, units=options.units, wall_thickness=options.wall_thickness)
         rooms, name, meta, stated = floor.polygons, floor.name or path.stem, floor.meta, floor.units
+        if floor.offset.any():
+            warnings.warn(f"{path}: {offset_text(floor.offset)}", FloorPlanWarning, stacklevel=3)
+            meta = {**meta, "offset": floor.offset.tolist()}
     else:
         raise InvalidFloorPlanError(
             "not a floor plan: expected the key 'exterior' (plan), 'verts' (HouseExpo) or a GeoJSON 'type'"
         )
     plan = _reached(rooms, meta, name, path, start, radius, options)
     x0, y0, x1, y1 = plan.bounds
-    if plan.area > LARGE_AREA and not stated and (hint := guess(x1 - x0, y1 - y0)):
+    if plan.area > LARGE_AREA and not stated:
+        hint = guess(x1 - x0, y1 - y0) or "; units (--units) takes a number, metres a unit"
         warnings.warn(
             f"{path}: the plan spans {x1 - x0:.4g} x {y1 - y0:.4g} m, more than buildings do{hint}; if it is metres, "
             "say units='m' (--units m)",

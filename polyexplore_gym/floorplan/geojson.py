@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,7 @@ import shapely
 
 from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.floorplan.model import FloorPlan, polygons
-from polyexplore_gym.floorplan.units import DEGREES, SMALL_SPAN, metres
+from polyexplore_gym.floorplan.units import DEGREES, SMALL_SPAN, metres, offset
 from polyexplore_gym.floorplan.validation import shorten, to_array
 
 POLYGONS = ("Polygon", "MultiPolygon")
@@ -46,6 +46,8 @@ class Floor:
     """Its properties."""
     units: bool
     """Whether units were given."""
+    offset: np.ndarray
+    """(2,) what was taken off the coordinates, m."""
 
 
 def read(data: Mapping[str, Any], *, units: object = None, wall_thickness: float | None = None) -> Floor:
@@ -76,7 +78,7 @@ def read(data: Mapping[str, Any], *, units: object = None, wall_thickness: float
     stated = next((p["units"] for _, _, p in found.polygons if "units" in p), None)
     given = stated if units is None else units
     shapes = [(where, _rings(rings, where), properties) for where, rings, properties in found.polygons]
-    place = _placing(given, np.concatenate([ring for _, rings, _ in shapes for ring in rings]))
+    place, shift = _placing(given, np.concatenate([ring for _, rings, _ in shapes for ring in rings]))
     areas = []
     for where, rings, properties in shapes:
         exterior, *holes = (place(ring) for ring in rings)
@@ -99,7 +101,9 @@ def read(data: Mapping[str, Any], *, units: object = None, wall_thickness: float
     if not isinstance(meta, Mapping):
         raise InvalidFloorPlanError(f"meta: expected an object, got {type(meta).__name__}")
     name = properties.get("name")
-    return Floor(polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None)
+    return Floor(
+        polygons=free, name=name if isinstance(name, str) else None, meta=meta, units=given is not None, offset=shift
+    )
 
 
 def _collect(data: Any, properties: Mapping[str, Any], where: str, found: _Found) -> None:
@@ -147,8 +151,8 @@ def _flat(points: Any) -> Any:
     return [point[:2] if isinstance(point, list) and len(point) == 3 else point for point in points]
 
 
-def _placing(units: object, points: np.ndarray) -> Any:
-    """The function that brings coordinates (n, 2) of the file to metres."""
+def _placing(units: object, points: np.ndarray) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """The function that brings coordinates (n, 2) of the file to metres, and what it takes off them, m."""
     if not len(points):
         points = np.zeros((1, 2))
     low, high = points.min(axis=0), points.max(axis=0)
@@ -160,12 +164,13 @@ def _placing(units: object, points: np.ndarray) -> Any:
                 f"GeoJSON: the plan spans {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} m, which is no building; if "
                 "the coordinates are longitude and latitude, say units='deg' (--units deg)"
             )
-        return lambda ring: ring if factor == 1.0 else ring * factor
+        taken = offset(factor * low, factor * high)
+        return lambda ring: ring * factor - taken, taken
     if (np.abs(points) > (180.0, 90.0)).any():
         raise InvalidFloorPlanError("units 'deg': the coordinates are no longitudes and latitudes")
     middle = (low + high) / 2
     scale = math.radians(1.0) * _EARTH * np.array([math.cos(math.radians(middle[1])), 1.0])
-    return lambda ring: (ring - middle) * scale
+    return lambda ring: (ring - middle) * scale, np.zeros(2)
 
 
 def _polygon(exterior: np.ndarray, holes: Sequence[np.ndarray], where: str) -> shapely.Polygon:

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.robot_map import MAX_PIXELS
 
-MAX_PIXELS = 100_000_000
-"""Largest image read."""
 MAX_BYTES = 1_000_000_000
 """Largest image file read."""
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -13,7 +13,6 @@ Specks, by one rule before rooms are chosen: see `without_specks`.
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -25,8 +24,9 @@ from typing import Any
 import numpy as np
 import shapely
 
+from polyexplore_gym import robot_map
 from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
-from polyexplore_gym.floorplan.images import MAX_PIXELS, read_image
+from polyexplore_gym.floorplan.images import read_image
 from polyexplore_gym.floorplan.model import PASSABLE, FloorPlan, pockets, polygons
 from polyexplore_gym.floorplan.reach import STEPS, Loss, keeps_most, last_true, tell, trim
 from polyexplore_gym.floorplan.validation import MAX_VERTICES, check_keys, shorten
@@ -35,8 +35,6 @@ MODES = ("trinary", "scale", "raw")
 """How pixels are read."""
 RADIUS = 0.25
 """Radius of the robot for which a map is read unless told, m: cracks that it cannot pass are closed."""
-RESOLUTION = 0.05
-"""Side of a pixel of the maps that are written, m."""
 SPECK_PIXELS = 4
 """Obstacles of so many pixels are specks, if they are no larger than `SPECK_AREA`."""
 SPECK_AREA = 0.02
@@ -51,7 +49,6 @@ MAX_BORDER = 1.0
 """A plan may run along the image's border so far without a word, m."""
 MAX_YAML = 1_000_000
 """Largest yaml read, bytes."""
-_SAVED_UNKNOWN = 205
 # A plain of one grey: so much of the image, and so many times its neighbours'.
 _PLAIN = (0.02, 10.0)
 # One grey that is neither free nor wall may fill so much of a plan without a word.
@@ -100,40 +97,22 @@ def load_ros_map(
     return plan.named(path.stem, {**meta, "radius": radius, "kept": round(min(plan.area / area, 1.0), 3)})
 
 
-def save_ros_map(plan: FloorPlan, path: Path, resolution: float = RESOLUTION) -> None:
+def save_ros_map(plan: FloorPlan, path: Path, resolution: float) -> None:
     """Write a plan as a map for map_server: the yaml at `path` and a .pgm beside it.
 
-    A pixel is free (254) if its centre lies in the plan, black next to free ones and where a wall is thinner than a
-    pixel, else unknown (205).
+    A pixel is free if its centre lies in the plan, occupied next to free ones and where a wall is thinner than a
+    pixel, else unknown.
 
     Raises:
-        InvalidFloorPlanError: the image would have more than `images.MAX_PIXELS`, or the resolution is no length.
+        InvalidFloorPlanError: the image would have too many pixels, or the resolution is no length.
     """
-    if not (math.isfinite(resolution) and 0 < resolution <= 10):
-        raise InvalidFloorPlanError(f"{path}: resolution {resolution!r}: must lie in (0, 10] m")
-    x0, y0, x1, y1 = plan.bounds
-    width, height = (math.ceil(round((high - low) / resolution, 6)) + 4 for low, high in ((x0, x1), (y0, y1)))
-    if width * height > MAX_PIXELS:
-        raise InvalidFloorPlanError(
-            f"{path}: {width} x {height} pixels of {resolution:g} m, more than {MAX_PIXELS}: take a larger resolution"
-        )
-    corner = np.array([x0, y0]) - 2 * resolution
-    image = _drawn(plan, corner, resolution, (height, width))
-    write_map(path, image, resolution, (float(corner[0]), float(corner[1])), name=plan.name)
-
-
-def write_map(path: Path, image: np.ndarray, resolution: float, corner: Sequence[float], *, name: str) -> None:
-    """Write the yaml at `path` and the image (h, w), uint8, beside it; `corner`: its lower left corner, m."""
-    height, width = image.shape
-    pgm = path.with_suffix(".pgm")
-    pgm.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + image.tobytes())
-    comment = "".join(character if character.isprintable() else " " for character in name)
-    text = (
-        f"# {comment}\nimage: {json.dumps(pgm.name)}\nmode: trinary\nresolution: {resolution!r}\n"
-        f"origin: [{corner[0]!r}, {corner[1]!r}, 0.0]\nnegate: 0\n"
-        f"occupied_thresh: {_DEFAULTS['occupied_thresh']}\nfree_thresh: {_DEFAULTS['free_thresh']}\n"
-    )
-    path.write_text(text, encoding="utf-8")
+    bounds = np.array(plan.bounds)
+    try:
+        height, width, corner = robot_map.raster(bounds[:2], bounds[2:], resolution)
+    except ValueError as error:
+        raise InvalidFloorPlanError(f"{path}: {error}") from error
+    image = _drawn(plan, np.array(corner), resolution, (height, width))
+    robot_map.write(path, image, resolution, corner, plan.name)
 
 
 def _drawn(plan: FloorPlan, corner: np.ndarray, resolution: float, shape: tuple[int, int]) -> np.ndarray:
@@ -157,7 +136,9 @@ def _drawn(plan: FloorPlan, corner: np.ndarray, resolution: float, shape: tuple[
             cv2.fillPoly(thin, [np.rint(points * 256).astype(np.int32)], 1, shift=8)
     free &= thin == 0
     beside = cv2.dilate(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return np.where(free, 254, np.where(beside | (thin > 0), 0, _SAVED_UNKNOWN)).astype(np.uint8)
+    return np.where(free, robot_map.FREE, np.where(beside | (thin > 0), robot_map.OCCUPIED, robot_map.UNKNOWN)).astype(
+        np.uint8
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,14 +212,15 @@ def _free(
         is_free &= opaque
         is_occupied &= opaque
     if fields["mode"] != "raw":
-        # A jpg smears its greys.
-        unknown = np.abs(levels - _SAVED_UNKNOWN) <= (3 if fields["image"].lower().endswith((".jpg", ".jpeg")) else 0)
+        # A jpg smears its greys, and other maxvals than 255 round them.
+        smeared = 3 if fields["image"].lower().endswith((".jpg", ".jpeg")) else int(brightness.dtype != np.uint8)
+        unknown = np.abs(levels - robot_map.UNKNOWN) <= smeared
         counts = _histogram(grey)
-        would_be_free = bool(free[_SAVED_UNKNOWN] and counts[unknown].any())
+        would_be_free = bool((free & unknown & (counts > 0)).any())
         if would_be_free and (fields["mode"] == "trinary" or _is_plain(counts)):
             is_free &= cv2.LUT(grey, unknown.astype(np.uint8)) == 0
             warnings.warn(
-                f"{path}: grey {_SAVED_UNKNOWN} is taken for unknown, which is what map savers write it for, though by "
+                f"{path}: grey {robot_map.UNKNOWN} is taken for unknown, for which map savers write it, though by "
                 f"free_thresh {fields['free_thresh']:g} it would be free",
                 FloorPlanWarning,
                 stacklevel=2,
@@ -246,7 +228,7 @@ def _free(
     if not is_free.any():
         raise InvalidFloorPlanError(
             "the map has no free pixel; check negate, free_thresh and occupied_thresh"
-            + (f" (grey {_SAVED_UNKNOWN} is taken for unknown)" if (grey == _SAVED_UNKNOWN).any() else "")
+            + (f" (grey {robot_map.UNKNOWN} is taken for unknown)" if (grey == robot_map.UNKNOWN).any() else "")
         )
     return without_specks(is_free, is_occupied, fields["resolution"])
 
@@ -272,8 +254,8 @@ def _histogram(grey: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
 
 def _is_plain(counts: np.ndarray) -> bool:
     """Whether the grey of map savers stands out among the shades of a scale."""
-    around = max(counts[_SAVED_UNKNOWN - 1], counts[_SAVED_UNKNOWN + 1])
-    return bool(counts[_SAVED_UNKNOWN] > max(_PLAIN[0] * counts.sum(), _PLAIN[1] * around))
+    around = max(counts[robot_map.UNKNOWN - 1], counts[robot_map.UNKNOWN + 1])
+    return bool(counts[robot_map.UNKNOWN] > max(_PLAIN[0] * counts.sum(), _PLAIN[1] * around))
 
 
 def without_specks(free: np.ndarray, occupied: np.ndarray, resolution: float) -> np.ndarray:

@@ -18,11 +18,11 @@ import numpy as np
 import shapely
 
 from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
-from polyexplore_gym.floorplan.units import guess
+from polyexplore_gym.floorplan.units import FAR, guess
 
 MAX_VERTICES = 20_000
 """Most vertices of a plan, all rings together."""
-MAX_COORDINATE = 10_000.0
+MAX_COORDINATE = FAR
 """Largest absolute coordinate, m."""
 MAX_EXTENT = 1_000_000.0
 """Largest bounding box, m2 (1 km2): its sample points for the share seen, 25 a square metre, take 1.4 GB."""

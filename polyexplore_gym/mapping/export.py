@@ -20,21 +20,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from polyexplore_gym import robot_map
 from polyexplore_gym.errors import MissingDependencyError, RenderingError
 from polyexplore_gym.mapping.log_map import LogMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAP_SUFFIXES = (".json", ".geojson", ".svg", ".png")
-"""What `save_map` writes."""
+MAP_SUFFIXES = (".json", ".geojson", ".svg", ".png", ".yaml")
+"""What `save_map` writes; a .yaml, for ROS map_server, with a .pgm beside it."""
 _WALL, _FRAGMENT, _POINT, _PATH, _INK = "#1f1f1f", "#d55e00", "#c4c4c4", "#0072b2", "#333333"
 _MOST_POINTS = 200_000
 """Of more returns than these only some are drawn."""
 
 
 def save_map(log_map: LogMap, path: str | Path, *, name: str = "line map", width: int = 1600) -> None:
-    """Write a line map; the suffix decides the format (.json, .geojson, .svg, .png).
+    """Write a line map; the suffix decides the format (.json, .geojson, .svg, .png, or .yaml with a .pgm beside it).
 
     Args:
         log_map: of `map_log`.
@@ -44,7 +45,7 @@ def save_map(log_map: LogMap, path: str | Path, *, name: str = "line map", width
 
     Raises:
         MissingDependencyError: a picture, and matplotlib is not installed.
-        RenderingError: the suffix is none of these, or the file cannot be written.
+        RenderingError: the suffix is none of these, the map is too large for an image, or the file cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -55,6 +56,10 @@ def save_map(log_map: LogMap, path: str | Path, *, name: str = "line map", width
             content = to_mapping(log_map, name) if suffix == ".json" else to_geojson(log_map, name)
             path.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
             return
+        if suffix == ".yaml":
+            image, corner = occupancy(log_map, robot_map.RESOLUTION)
+            robot_map.write(path, image, robot_map.RESOLUTION, corner, name)
+            return
         figure = map_figure(log_map, name, width)
         import matplotlib
 
@@ -63,6 +68,36 @@ def save_map(log_map: LogMap, path: str | Path, *, name: str = "line map", width
             figure.savefig(path, dpi=figure.dpi, metadata={"Date": None} if suffix == ".svg" else {})
     except OSError as error:
         raise RenderingError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def occupancy(log_map: LogMap, resolution: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """The line map as an image of a robot map (h, w), uint8, and its lower left corner, m.
+
+    Occupied is where a wall or fragment runs, free what a beam passed through on its way to a return, the rest unknown.
+
+    Raises:
+        RenderingError: the image would be too large.
+    """
+    import cv2
+
+    ends = np.concatenate([log_map.segments, log_map.fragments])
+    corners = np.concatenate([log_map.points, log_map.path[:, :2], ends.reshape(-1, 2)])
+    try:
+        height, width, corner = robot_map.raster(corners.min(axis=0), corners.max(axis=0), resolution)
+    except ValueError as error:
+        raise RenderingError(str(error)) from error
+    image = np.full((height, width), robot_map.UNKNOWN, np.uint8)
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        """Columns and rows (n, 2)."""
+        across = np.floor((points - corner) / resolution).astype(np.int32)
+        return np.column_stack([across[:, 0], height - 1 - across[:, 1]])
+
+    beams = np.stack([pixels(log_map.path[:, :2])[log_map.point_scan], pixels(log_map.points)], axis=1)
+    walls = np.stack([pixels(ends[:, :2]), pixels(ends[:, 2:])], axis=1)
+    cv2.polylines(image, list(np.unique(beams, axis=0)), False, robot_map.FREE)
+    cv2.polylines(image, list(walls), False, robot_map.OCCUPIED)
+    return image, corner
 
 
 def to_mapping(log_map: LogMap, name: str) -> dict[str, Any]:

@@ -52,6 +52,8 @@ class LogMap:
     """(scans used, 3) x, y (m), heading (rad) of the laser."""
     points: np.ndarray
     """(P, 2) all returns of the scans used, m."""
+    point_scan: np.ndarray
+    """(P,) index of each return's scan in `path`."""
     on_line: np.ndarray
     """(P,) whether a return lies on a line of its own scan."""
     distances: np.ndarray
@@ -212,6 +214,7 @@ def map_log(
         fragments=parts[~wall],
         path=poses[used],
         points=np.concatenate(points),
+        point_scan=np.repeat(np.arange(len(points)), [len(some) for some in points]),
         on_line=np.concatenate(on_line),
         distances=np.concatenate(distances),
         lines_of_scans=lines,

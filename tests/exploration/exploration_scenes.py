@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 import shapely
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
+
+from polyexplore_gym.config import ExplorationConfig, SensorConfig
+from polyexplore_gym.exploration.tolerances import Tolerances, tolerances
+
+
+def tol_of(sensor: SensorConfig | None = None, radius: float = 0.25, **changes: float) -> Tolerances:
+    """The tolerances of a robot with the default exploration, some of them changed."""
+    return tolerances(ExplorationConfig(), sensor or SensorConfig(), radius)._replace(**changes)
+
 
 # Scenes ------------------------------------------------------------------------------------------
 
@@ -183,6 +193,27 @@ def shortest_lengths(area: shapely.Geometry, points: np.ndarray) -> np.ndarray:
     length = np.hypot(*(v[i] - v[j]).T)
     graph = csr_matrix((np.maximum(length, 1e-12), (i, j)), shape=(len(v), len(v)))
     return dijkstra(graph, directed=False, indices=np.arange(k))[:, :k]
+
+
+# Openings -----------------------------------------------------------------------------------------
+
+
+def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
+    """Width of the opening behind a chain of open edges (m, 4) in order: the gaps in it and on to the walls count.
+
+    What runs round the tip of a shadow is as wide as its bounding box at most, crumbs far apart as twice their length.
+    """
+    edges = shapely.linestrings(chain.reshape(-1, 2, 2))
+    total = shapely.length(edges).sum()
+    gaps = sum(math.dist(a[2:], b[:2]) for a, b in itertools.pairwise(chain))
+    x0, y0, x1, y1 = shapely.total_bounds(edges)
+    width = min(total + gaps, math.hypot(x1 - x0, y1 - y0))
+    if width >= tol.gap:
+        return float(width)
+    for end in (chain[0, :2], chain[-1, 2:]):
+        away = lines_of(walls).distance(shapely.Point(end)) if len(walls) else math.inf
+        width += away if away < tol.cover + tol.join else 0.0
+    return float(min(width, 2.0 * total))
 
 
 # Star polygons ------------------------------------------------------------------------------------

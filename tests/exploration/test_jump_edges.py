@@ -8,12 +8,15 @@ import math
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import star
+from exploration_scenes import star, tol_of, width_of
 
+from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration import jump_edges as je
 from polyexplore_gym.exploration import scan_polygon as sp
 
 NO_WALLS = np.zeros((0, 4))
+EXACT = tol_of(SensorConfig(sigma_range=0.0, sigma_angle=0.0), max_range=8.0)
+"""A map without noise, so that what is asked for is what counts."""
 
 
 def scans(rng, count, fov, n=80, spread=3.0):
@@ -26,7 +29,7 @@ def scans(rng, count, fov, n=80, spread=3.0):
         points[s], rays[s] = sp.corner_points(angles, ranges, headings[s], 8.0)
         corners = apexes[s] + (points[s] if full else np.vstack([[0.0, 0.0], points[s]]))
         areas.append(shapely.Polygon(corners))
-    return apexes, headings, points, rays, angles, full, areas
+    return sp.Scans(apexes, headings, points, rays, angles, full, 8.0), areas
 
 
 def random_pieces(rng, m, half=6.0):
@@ -51,13 +54,12 @@ def strip(wall, margin):
 @pytest.mark.parametrize("nudge", [0.0, 0.05])
 def test_clip_is_the_difference_from_the_union_of_scan_polygons(fov, nudge):
     rng = np.random.default_rng([1, int(10 * fov), int(100 * nudge)])
+    tol = EXACT._replace(nudge=nudge, crumb=1e-9)
     for _ in range(25):
-        apexes, headings, points, rays, angles, full, areas = scans(rng, 6, fov)
+        looks, areas = scans(rng, 6, fov)
         pieces = random_pieces(rng, 60)
         first, last = sorted(rng.integers(0, 7, 2))
-        got, origin, changed = je.clip(
-            pieces, apexes, headings, points, rays, first, last, angles, full, 8.2, nudge, NO_WALLS, 0.04, 1e-9
-        )
+        got, origin, changed = je.clip(pieces, np.zeros(60), looks, first, last, NO_WALLS, tol)
         union = shapely.union_all(areas[first:last])
         inner = union.buffer(-1e-6)
         for i, piece in enumerate(pieces):
@@ -77,16 +79,15 @@ def test_clip_is_the_difference_from_the_union_of_scan_polygons(fov, nudge):
 
 def test_clip_by_walls_along_them_only():
     rng = np.random.default_rng(2)
-    apexes, headings, points, rays, angles, full, _ = scans(rng, 1, math.pi)
+    looks, _ = scans(rng, 1, math.pi)
+    tol = EXACT._replace(cover=0.06, crumb=1e-9)
     covered = spared = 0
     for _ in range(40):
         pieces = random_pieces(rng, 20, 2.0)
         walls = random_pieces(rng, 8, 2.0)
         for k in range(0, 8, 2):  # some run along pieces
             walls[k] = pieces[k] + rng.normal(0, 0.02, 4)
-        got, origin, _ = je.clip(
-            pieces, apexes, headings, points, rays, 0, 0, angles, full, 8.2, 0.05, walls, 0.06, 1e-9
-        )
+        got, origin, _ = je.clip(pieces, np.zeros(20), looks, 0, 0, walls, tol)
         w = walls[:, 2:] - walls[:, :2]
         for i, piece in enumerate(pieces):
             d = piece[2:] - piece[:2]
@@ -156,7 +157,8 @@ def test_link_covers_every_piece_once_in_touching_order():
         pieces, group = np.array(rows)[shuffle], np.array(group)[shuffle]
         pieces += rng.normal(0, 0.003, pieces.shape)
         shortest, longest = 0.5, rng.choice([2.0, 8.0])
-        order, offsets = je.link(pieces, 0.05, shortest, longest)
+        tol = EXACT._replace(join=0.05, gap=shortest, max_range=longest)
+        order, offsets = je.link(pieces, np.zeros(len(pieces)), NO_WALLS, tol)
         assert sorted(order) == list(range(len(pieces)))
         assert offsets[0] == 0
         assert offsets[-1] == len(pieces)
@@ -166,7 +168,9 @@ def test_link_covers_every_piece_once_in_touching_order():
             chain = order[a:b]
             assert len(set(group[chain])) == 1
             gaps = np.hypot(*(pieces[chain[1:], :2] - pieces[chain[:-1], 2:]).T)
-            assert (gaps < 0.05).all()
+            # One that ends near its beginning is a ring, which may be cut anywhere else.
+            assert (gaps < shortest).all()
+            assert (gaps >= 0.05).sum() <= 1
             total = size[group == group[chain[0]]].sum()
             length = size[chain].sum()
             if length < total - 1e-9:  # cut: no part too short, nor much too long
@@ -187,7 +191,7 @@ def test_link_of_a_closed_ring():
     t = np.linspace(0, 2 * math.pi, 25)
     p = 2.0 * np.stack((np.cos(t), np.sin(t)), axis=1)
     pieces = np.hstack([p[:-1], p[1:]])[np.random.default_rng(5).permutation(24)]
-    order, offsets = je.link(pieces, 0.05, 0.5, 8.0)
+    order, offsets = je.link(pieces, np.zeros(24), NO_WALLS, EXACT._replace(join=0.05, gap=0.5))
     assert sorted(order) == list(range(24))
     lengths = [np.hypot(*(pieces[order[a:b], 2:] - pieces[order[a:b], :2]).T).sum() for a, b in
                itertools.pairwise(offsets)]  # fmt: skip
@@ -198,31 +202,158 @@ def test_link_of_a_closed_ring():
 
 def test_link_prefers_the_nearest_end_and_leaves_the_rest():
     pieces = np.array([[0, 0, 1, 0], [1.03, 0, 2, 0], [1.01, 0, 1, 2], [0, 0.2, 1, 0.2]], float)
-    order, offsets = je.link(pieces, 0.05, 0.1, 8.0)
+    tol = EXACT._replace(join=0.05, gap=0.1)
+    order, offsets = je.link(pieces, np.zeros(4), NO_WALLS, tol)
     chains = sorted(tuple(order[a:b].tolist()) for a, b in itertools.pairwise(offsets))
-    assert chains == [(0,), (1,), (2,), (3,)] or chains == [(0, 2), (1,), (3,)]
-    order, offsets = je.link(pieces[[0, 1, 3]], 0.05, 0.1, 8.0)
+    assert chains == [(0,), (1,), (2,), (3,)]  # 0 goes on in 2, round a corner
+    order, offsets = je.link(pieces[[0, 1, 3]], np.zeros(3), NO_WALLS, tol)
     chains = sorted(tuple(order[a:b].tolist()) for a, b in itertools.pairwise(offsets))
     assert chains == [(0, 1), (2,)]
 
 
+def gapped(rng, start, parts):
+    """A chain of pieces with small gaps between some of them."""
+    pieces = np.array(wandering(rng, start, parts, 0.3)) * rng.choice([0.2, 1.0])
+    for k in range(1, len(pieces)):
+        if rng.random() < 0.4:
+            t = rng.uniform(0.0, 2.0 * math.pi)
+            pieces[k:] += np.tile(rng.uniform(0.0, 0.4) * np.array([math.cos(t), math.sin(t)]), 2)
+    return pieces
+
+
 def test_summarise():
     rng = np.random.default_rng(7)
-    for _ in range(100):
-        pieces = np.array(wandering(rng, (1.0, 2.0), int(rng.integers(1, 10)), 0.3))
-        m = len(pieces)
+    tol, narrow = EXACT, 0
+    for _ in range(200):
+        chains = [gapped(rng, (9.0 * k, 2.0), int(rng.integers(1, 10))) for k in range(3)]
+        pieces = np.concatenate(chains)
+        walls = random_pieces(rng, 5)
+        walls[:3, :2] = [c[-1, 2:] + rng.normal(0.0, 0.05, 2) for c in chains]
+        m, offsets = len(pieces), np.concatenate(([0], np.cumsum([len(c) for c in chains])))
         kinds, visits = rng.integers(1, 4, m).astype(np.int8), rng.integers(0, 3, m)
-        data, ends, kind, visit = je.summarise(pieces, kinds, visits, np.arange(m), np.array([0, m]))
-        way = shapely.LineString([pieces[0, :2], *pieces[:, 2:]])
-        assert data[0, 0] == pytest.approx(way.length)
-        middle = shapely.get_coordinates(way.interpolate(0.5, normalized=True))[0]
-        np.testing.assert_allclose(data[0, 1:3], middle, atol=1e-9)
-        np.testing.assert_allclose(ends[0], [*pieces[0, :2], *pieces[-1, 2:]])
-        size = np.hypot(*(pieces[:, 2:] - pieces[:, :2]).T)
-        assert kind[0] == np.argmax([size[kinds == k].sum() for k in range(4)])
-        assert visit[0] == visits.max()
-        chord = ends[0, 2:] - ends[0, :2]
-        np.testing.assert_allclose(np.hypot(*data[0, 3:5]), 1.0)
-        if np.hypot(*chord) > 0.31 * way.length:
-            assert abs(data[0, 3:5] @ chord) < 1e-9
-            assert chord[0] * data[0, 4] - chord[1] * data[0, 3] < 0  # into the unknown, on the right
+        shuffle = rng.permutation(m)
+        order = np.argsort(shuffle)
+        got = je.summarise(pieces[shuffle], kinds[shuffle], visits[shuffle], order, offsets, walls, 70, tol)
+        np.testing.assert_array_equal(got.id, [70, 71, 72])
+        for q, chain in enumerate(chains):
+            mine = slice(offsets[q], offsets[q + 1])
+            size = np.hypot(*(chain[:, 2:] - chain[:, :2]).T)
+            assert got.length[q] == pytest.approx(size.sum())
+            assert got.width[q] == pytest.approx(width_of(chain, walls, tol))
+            narrow += got.width[q] < tol.gap
+            way = shapely.multilinestrings(chain.reshape(-1, 2, 2))
+            middle = shapely.get_coordinates(way.interpolate(0.5, normalized=True))[0]
+            np.testing.assert_allclose(got.middle[q], middle, atol=1e-9)
+            np.testing.assert_allclose(got.ends[q], [*chain[0, :2], *chain[-1, 2:]])
+            assert got.kind[q] == np.argmax([size[kinds[mine] == k].sum() for k in range(4)])
+            assert got.visits[q] == visits[mine].max()
+            chord = got.ends[q, 2:] - got.ends[q, :2]
+            np.testing.assert_allclose(np.hypot(*got.normal[q]), 1.0)
+            if np.hypot(*chord) > 0.31 * way.length:
+                assert abs(got.normal[q] @ chord) < 1e-9
+                assert chord[0] * got.normal[q, 1] - chord[1] * got.normal[q, 0] < 0  # into the unknown, on the right
+    assert narrow > 30
+
+
+def width(pieces, walls=NO_WALLS, tol=EXACT):
+    """The width that one chain gets."""
+    m = len(pieces)
+    chain = np.array(pieces, float)
+    new = je.summarise(chain, np.ones(m, np.int8), np.zeros(m, np.int64), np.arange(m), np.array([0, m]), walls, 0, tol)
+    return float(new.width[0])
+
+
+def test_width_of_an_opening():
+    # (The gap of interest is 0.5 m.) Two parts of a doorway: the gap between them is part of the opening.
+    assert width([[0, 0, 0.15, 0], [0.3, 0, 0.45, 0]]) == pytest.approx(0.45)
+    # A ring round the tip of a shadow is long, but not wide.
+    t = np.linspace(0, 2 * math.pi, 13)
+    p = 0.1 * np.stack((np.cos(t), np.sin(t)), axis=1)
+    assert width(np.hstack([p[:-1], p[1:]])) == pytest.approx(0.2 * math.sqrt(2.0))
+    # It goes on to the walls at its ends, as far as walls cover open edges and open edges touch, no farther.
+    walls = np.array([[-0.05, 0, -0.05, 3], [0.44, -1, 0.44, 1], [0.0, 0.6, 0.5, 0.6]], float)
+    assert width([[0, 0, 0.4, 0]], walls) == pytest.approx(0.49)
+    far = EXACT.cover + EXACT.join + 0.001
+    assert width([[0, 0, 0.4, 0]], np.array([[-far, 0, -far, 3]])) == pytest.approx(0.4)
+    # Crumbs far apart are no opening.
+    assert width([[0, 0, 0.03, 0], [0.4, 0, 0.43, 0]]) == pytest.approx(0.12)
+    # What is wide enough is left alone.
+    assert width([[0, 0, 0.6, 0]], walls) == pytest.approx(0.6)
+
+
+def successors(pieces, sigma, walls, tol):
+    """Slow twin: mutually nearest ends, first those that touch, then across gaps without a wall."""
+    n = len(pieces)
+    lines = shapely.multilinestrings(walls.reshape(-1, 2, 2))
+    after, taken = [-1] * n, [False] * n
+    for wide in (False, True):
+        near = {}
+        for i, j in itertools.permutations(range(n), 2):
+            d = math.dist(pieces[i, 2:], pieces[j, :2])
+            limit = tol.gap if wide else tol.join + 2.0 * max(sigma[i], sigma[j])
+            middle = shapely.Point(0.5 * (pieces[i, 2:] + pieces[j, :2]))
+            if after[i] >= 0 or taken[j] or d >= limit or (wide and lines.distance(middle) <= tol.cover):
+                continue
+            near[i, j] = d
+        for (i, j), d in near.items():
+            if d == min(e for (a, b), e in near.items() if a == i or b == j):
+                after[i], taken[j] = j, True
+    return after
+
+
+def test_successors_bridge_gaps_only_where_no_wall_stands():
+    rng = np.random.default_rng(8)
+    bridged = walled = 0
+    for _ in range(150):
+        m = int(rng.integers(2, 25))
+        pieces = random_pieces(rng, m, 1.5)
+        for k in range(1, m, 2):  # every other one begins near the end of another
+            pieces[k] += np.tile(pieces[k - 1, 2:] + rng.normal(0.0, rng.choice([0.02, 0.25]), 2) - pieces[k, :2], 2)
+        walls = random_pieces(rng, int(rng.integers(1, 6)), 1.5)
+        inside = 0.5 * (pieces[:-1:2, 2:] + pieces[1::2, :2])[: len(walls)]  # of such gaps
+        walls[: len(inside), :2] = inside + rng.normal(0.0, 0.05, inside.shape)
+        sigma = rng.choice([0.0, 0.01, 0.05], m)
+        got = je._successors(pieces, sigma, walls, EXACT)
+        assert got.tolist() == successors(pieces, sigma, walls, EXACT)
+        free = je._successors(pieces, sigma, NO_WALLS, EXACT)
+        bridged += sum(math.dist(pieces[i, 2:], pieces[j, :2]) > 0.25 for i, j in enumerate(got) if j >= 0)
+        walled += (free != got).sum()
+    assert bridged > 50
+    assert walled > 50
+
+
+# What a look shows --------------------------------------------------------------------------------
+
+
+def test_a_look_counts_only_if_it_could_have_shown_what_is_behind():
+    """From the known side, square enough, dense enough, within range, and not hidden: at three points of an edge."""
+    rng = np.random.default_rng(9)
+    counts, reasons = [0, 0], np.zeros(4, np.int64)
+    for fov, beams in itertools.product((1.5, 2 * math.pi), (30, 90, 400) * 20):
+        looks, areas = scans(rng, 1, fov, beams, 0.5)
+        apex = looks.apexes[0]
+        sensor = SensorConfig(beams=beams, max_range=5.0, sigma_range=0.01, sigma_angle=0.002)
+        tol = tol_of(sensor, step=float(looks.angles[1] - looks.angles[0]))
+        pieces, sigma = random_pieces(rng, 80, 6.0), rng.choice([0.0, 0.02], 80)
+        pieces[::2, 2:] = pieces[::2, :2] + 0.3 * (pieces[::2, 2:] - pieces[::2, :2])
+        d = pieces[:, 2:] - pieces[:, :2]
+        normal = np.stack((d[:, 1], -d[:, 0]), axis=1) / np.hypot(*d.T)[:, None]  # into the unknown
+        bad, close_call = np.zeros((80, 4), np.bool_), np.zeros(80, np.bool_)
+        for share in (0.1, 0.5, 0.9):
+            point = pieces[:, :2] + share * d
+            away = np.hypot(*(point - apex).T)
+            cosine = ((point - apex) * normal).sum(axis=1) / away  # of the incidence; negative from the unknown side
+            across = tol.gap * cosine / (away * tol.step)  # beams across a gap of interest
+            noise = np.maximum(sigma, np.hypot(tol.sigma_range, tol.sigma_angle * away))
+            before = shapely.points(point - (tol.nudge + 2.0 * noise)[:, None] * normal)
+            limits = away - (5.0 - tol.gap), 0.26 - cosine, 2.0 - across
+            bad |= np.stack((*(x > 0.0 for x in limits), ~shapely.covers(areas[0], before)), axis=1)
+            close_call |= np.min(np.abs((*limits, shapely.distance(areas[0].boundary, before))), axis=0) < 1e-9
+        got = je.shown(pieces, sigma, looks, 0, tol)
+        sure = ~close_call
+        assert (got == ~bad.any(axis=1))[sure].all()
+        counts[0] += (~got).sum()
+        counts[1] += got.sum()
+        reasons += bad[bad.sum(axis=1) == 1].sum(axis=0)
+    assert min(counts) > 100
+    assert (reasons > 10).all()  # each of the conditions has turned pieces down alone

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import box, clear_points, free_space, lines_of, scene
+from exploration_scenes import box, clear_points, free_space, lines_of, scene, width_of
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import ExplorationMap, scan_polygon, shapes
@@ -90,25 +90,25 @@ def test_open_edges_are_the_boundary_of_the_union_less_the_walls(name, seed):
         area = shapes.exploration_polygon(e)
         boundary = area.boundary
         # Slivers of unknown as thin as the nudge may be closed already.
-        closed = area.buffer(e.nudge, join_style="mitre").buffer(-e.nudge, join_style="mitre").boundary
+        closed = area.buffer(e.tol.nudge, join_style="mitre").buffer(-e.tol.nudge, join_style="mitre").boundary
         walls = lines_of(explorer.walls)
         # Chords of range edges lie inside their arcs, and more so where they begin at a return just within range.
-        arcs = e.kinds == scan_polygon.RANGE
-        chords, pieces = (shapely.multilinestrings(e.pieces[m].reshape(-1, 2, 2)) for m in (arcs, ~arcs))
-        near, far = e.nudge + 0.04, e.nudge + 0.11
+        arcs = e.pieces.kind == scan_polygon.RANGE
+        chords, pieces = (shapely.multilinestrings(e.pieces.segments[m].reshape(-1, 2, 2)) for m in (arcs, ~arcs))
+        near, far = e.tol.nudge + 0.04, e.tol.nudge + 0.11
         # What is kept lies on the boundary.
         assert not parts_longer_than(pieces.difference(boundary.buffer(near)), 0.1)
         # (A chord too deep in its arc may outlive an arc that another scan covers, by less than a jump edge.)
-        assert not parts_longer_than(chords.difference(boundary.buffer(far)), e.min_gap)
+        assert not parts_longer_than(chords.difference(boundary.buffer(far)), e.tol.gap)
         # What the boundary has is kept, but walls and crumbs.
-        wanted = closed.difference(walls.buffer(e.cover + 0.01))
+        wanted = closed.difference(walls.buffer(e.tol.cover + 0.01))
         missing = wanted.difference(pieces.buffer(near).union(chords.buffer(far)))
         assert not parts_longer_than(missing, 0.2), [p.wkt for p in parts_longer_than(missing, 0.2)]
         # The unknown is on the right.
-        straight = e.pieces[~arcs]
+        straight = e.pieces.segments[~arcs]
         d = straight[:, 2:] - straight[:, :2]
         size = np.hypot(*d.T)
-        aside = (e.nudge + 0.001) * np.stack((d[:, 1], -d[:, 0]), axis=1) / size[:, None]
+        aside = (e.tol.nudge + 0.001) * np.stack((d[:, 1], -d[:, 0]), axis=1) / size[:, None]
         beyond = 0.5 * (straight[:, :2] + straight[:, 2:]) + aside
         inner = area.buffer(-0.002)
         shapely.prepare(inner)
@@ -122,19 +122,23 @@ def test_chains_own_their_pieces_in_order(seed):
         explorer.pose = np.array([*place, rng.uniform(-math.pi, math.pi)])
         explorer.look()
         e, c = explorer.map, explorer.map.chains
-        assert len(np.unique(c.id)) == len(c)
+        assert len(np.unique(c.id)) == c.size
         for i, chain in enumerate(c.id):
-            mine = e.pieces[e.owner == chain]
+            mine = e.pieces.segments[e.pieces.owner == chain]
             assert len(mine)
             size = np.hypot(*(mine[:, 2:] - mine[:, :2]).T)
             assert size.sum() == pytest.approx(c.length[i])
-            assert c.length[i] >= e.min_gap
-            assert (np.hypot(*(mine[1:, :2] - mine[:-1, 2:]).T) < e.join).all()
+            assert c.width[i] == pytest.approx(width_of(mine, explorer.walls, e.tol))
+            assert c.width[i] >= e.least_width
+            gaps = np.hypot(*(mine[1:, :2] - mine[:-1, 2:]).T)
+            assert (gaps < e.tol.gap).all()
+            across = 0.5 * (mine[1:, :2] + mine[:-1, 2:])[gaps >= e.tol.join]  # one opening, but no wall stands in it
+            assert (shapely.distance(lines_of(explorer.walls), shapely.points(across)) > e.tol.cover).all()
             np.testing.assert_allclose(c.ends[i], [*mine[0, :2], *mine[-1, 2:]])
         known = set(c.id.tolist())
-        for chain in set(e.owner[e.owner >= 0].tolist()) - known:  # too short to matter
-            mine = e.pieces[e.owner == chain]
-            assert np.hypot(*(mine[:, 2:] - mine[:, :2]).T).sum() < e.min_gap
+        for chain in set(e.pieces.owner[e.pieces.owner >= 0].tolist()) - known:  # too short to matter
+            mine = e.pieces.segments[e.pieces.owner == chain]
+            assert width_of(mine, explorer.walls, e.tol) < e.least_width
 
 
 def test_order_of_scans_does_not_change_the_open_boundary():
@@ -146,7 +150,7 @@ def test_order_of_scans_does_not_change_the_open_boundary():
         for k in order[1:]:
             other.pose = poses[k]
             other.look()
-        lines.append(shapely.multilinestrings(other.map.pieces.reshape(-1, 2, 2)))
+        lines.append(shapely.multilinestrings(other.map.pieces.segments.reshape(-1, 2, 2)))
     assert not parts_longer_than(lines[0].difference(lines[1].buffer(0.08)), 0.2)
     assert not parts_longer_than(lines[1].difference(lines[0].buffer(0.08)), 0.2)
 
@@ -170,9 +174,9 @@ def explored(name, seed, scans=3, **config):
 def in_sight(e, a, b, own):
     """By shapely: no wall on the way but within 5 cm of b, no open edge of others but within 5 cm of a or b."""
     way = shapely.LineString([a, b])
-    alive = lines_of(e.graph.walls)
-    others = ~np.isin(e.owner, [o for o in own if o >= 0]) | (e.owner < 0)
-    open_edges = shapely.multilinestrings(e.pieces[others].reshape(-1, 2, 2))
+    alive = lines_of(e.graph.walls.segments)
+    others = ~np.isin(e.pieces.owner, [o for o in own if o >= 0]) | (e.pieces.owner < 0)
+    open_edges = shapely.multilinestrings(e.pieces.segments[others].reshape(-1, 2, 2))
     near_a, near_b = shapely.Point(a).buffer(0.05, 32), shapely.Point(b).buffer(0.05, 32)
     if not way.intersection(alive).difference(near_b).is_empty:
         return False
@@ -184,16 +188,16 @@ def test_midpoint_nodes(seed):
     explorer = explored("half", seed)
     e, c = explorer.map, explorer.map.chains
     walls = lines_of(explorer.walls)
-    for i in range(len(c)):
-        stands = walls.distance(shapely.Point(c.middle[i])) >= e.graph.need
+    for i in range(c.size):
+        stands = walls.distance(shapely.Point(c.middle[i])) >= e.tol.need
         if stands and np.isfinite(c.path_length[i]) and np.hypot(*(c.node[i, :2] - c.middle[i])) < 1e-9:
             assert c.node[i, 2] == pytest.approx(math.atan2(c.normal[i, 1], c.normal[i, 0]))
         if c.vertex[i] < 0:
             assert np.isinf(c.path_length[i])
             continue
-        assert walls.distance(shapely.Point(c.node[i, :2])) >= e.graph.need - 0.021
+        assert walls.distance(shapely.Point(c.node[i, :2])) >= e.tol.need - 0.021
         # Some of the edge is seen from the node, and the node looks at it.
-        mine = shapely.multilinestrings(e.pieces[e.owner == c.id[i]].reshape(-1, 2, 2))
+        mine = shapely.multilinestrings(e.pieces.segments[e.pieces.owner == c.id[i]].reshape(-1, 2, 2))
         targets = [mine.interpolate(f, normalized=True) for f in np.linspace(0.02, 0.98, 25)]
         targets = [shapely.Point(c.middle[i]), *targets]
         assert any(
@@ -201,7 +205,7 @@ def test_midpoint_nodes(seed):
             for p in targets
         )
     placed = (c.vertex >= 0) & (np.hypot(*(c.node[:, :2] - c.middle).T) < 1e-9)
-    if len(c) >= 3:
+    if c.size >= 3:
         assert placed.any()
 
 
@@ -228,12 +232,12 @@ def test_in_front_nodes_keep_their_distance():
 def test_gains_by_brute_force(name, seed):
     explorer = explored(name, seed)
     e, c = explorer.map, explorer.map.chains
-    for n in range(len(c)):
+    for n in range(c.size):
         if c.vertex[n] < 0:
             continue
         p = c.node[n, :2]
         low = high = math.pi
-        for i in range(len(c)):
+        for i in range(c.size):
             if i == n or np.hypot(*(c.middle[i] - p)) > e.sensor.max_range:
                 continue
             a, b = c.ends[i, :2] - p, c.ends[i, 2:] - p
@@ -251,7 +255,7 @@ def test_paths_lead_to_the_nodes_through_known_space(name, seed):
     explorer = explored(name, seed)
     e, c = explorer.map, explorer.map.chains
     walls = lines_of(explorer.walls)
-    area = shapes.exploration_polygon(e).buffer(e.nudge + 0.05)
+    area = shapes.exploration_polygon(e).buffer(e.tol.nudge + 0.05)
     for i in np.flatnonzero(e.reachable):
         path = e.path_to(i)
         np.testing.assert_allclose(path[0], explorer.pose[:2])
@@ -263,11 +267,11 @@ def test_paths_lead_to_the_nodes_through_known_space(name, seed):
         start = walls.distance(shapely.Point(path[0]))
         assert walls.distance(way) >= min(RADIUS, start - 0.01)
         assert way.difference(area).length < 0.6
-        others = shapely.multilinestrings(e.pieces[e.owner != c.id[i]].reshape(-1, 2, 2))
+        others = shapely.multilinestrings(e.pieces.segments[e.pieces.owner != c.id[i]].reshape(-1, 2, 2))
         ends = shapely.union_all([shapely.Point(path[0]).buffer(0.31), shapely.Point(path[-1]).buffer(0.31)])
         assert way.intersection(others).difference(ends).is_empty
     rows = np.flatnonzero(c.vertex >= 0)[::-1]
-    between = e.path_lengths(np.arange(len(c)))
+    between = e.path_lengths(np.arange(c.size))
     np.testing.assert_allclose(between, between.T, atol=1e-9)
     assert (np.diag(between)[rows] == 0).all()
     straight = np.hypot(*(c.node[:, None, :2] - c.node[None, :, :2]).transpose(2, 0, 1))
@@ -346,9 +350,12 @@ def test_shapes_are_valid_and_agree_with_what_was_seen(name):
     # The area by sampling, point by point in scan by scan.
     x0, y0, x1, y1 = area.bounds
     q = rng.uniform((x0, y0), (x1, y1), (20_000, 2))
-    seen = np.zeros(len(q), np.bool_)
+    seen, looks = np.zeros(len(q), np.bool_), e.scans
     for s in range(e.n_scans):
-        seen |= [scan_polygon.contains(x, y, e.points[s], e.angles, e.headings[s], e.full) for x, y in q - e.apexes[s]]
+        seen |= [
+            scan_polygon.contains(x, y, looks.points[s], looks.angles, looks.headings[s], looks.full)
+            for x, y in q - looks.apexes[s]
+        ]
     box_area = (x1 - x0) * (y1 - y0)
     assert seen.mean() * box_area == pytest.approx(area.area, abs=4 * box_area / math.sqrt(len(q)) / 2)
     assert (shapely.contains_xy(area, q) == seen).mean() > 0.999
@@ -376,9 +383,9 @@ def test_geojson_loads_back():
         loaded.setdefault(feature["properties"]["kind"], []).append((geometry, feature["properties"]))
     assert loaded["exploration_polygon"][0][0].equals(shapes.exploration_polygon(e))
     edges = loaded.get("jump_edge", [])
-    assert len(edges) == len(e.chains)
+    assert len(edges) == e.chains.size
     for i, (line, properties) in enumerate(edges):
-        assert line.length == pytest.approx(properties["length"], abs=0.1 + e.join * 5)
+        assert line.length == pytest.approx(properties["length"], abs=0.1 + e.tol.join * 5)
         assert properties["reachable"] == bool(e.reachable[i])
         np.testing.assert_allclose(shapely.get_coordinates(line)[[0, -1]].ravel(), e.chains.ends[i])
 
@@ -389,7 +396,7 @@ def test_geojson_loads_back():
 def test_a_closed_room_has_no_jump_edges():
     explorer = Explorer(box(-3, -2, 3, 2), [0.3, 0.2, 0.4], HALF)
     explorer.look_round()
-    assert len(explorer.plan()) == 0
+    assert explorer.plan().size == 0
     assert shapes.exploration_polygon(explorer.map).area == pytest.approx(24.0, rel=0.01)
 
 
@@ -399,7 +406,7 @@ def test_one_door_is_one_jump_edge_with_its_node_in_the_door():
     explorer.look_round()
     c = explorer.plan()
     reach = 1.0 / 1.5 * 3.0  # the cone through the door opens to the far wall
-    assert len(c) == 2
+    assert c.size == 2
     np.testing.assert_allclose(np.sort(c.middle[:, 1]), [-1.0, 1.0], atol=0.3)
     assert (c.length < 1.2 * math.hypot(3.0, reach)).all()
     assert np.isfinite(c.path_length).all()

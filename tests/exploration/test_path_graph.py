@@ -9,23 +9,24 @@ import networkx as nx
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths
+from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths, tol_of
 
+from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL
 from polyexplore_gym.exploration.path_graph import PathGraph
 
 RADIUS = 0.25
-SLACK = 0.3
+TOL = tol_of(SensorConfig(max_range=8.0), RADIUS)
 ALL = np.array([-1e3, -1e3, 1e3, 1e3])
 NO_PIECES, NO_OWNER = np.zeros((0, 4)), np.zeros(0, np.int64)
 
 
-def graph_of(walls, radius=RADIUS, pieces=None, owner=None):
+def graph_of(walls, tol=TOL, pieces=None, owner=None):
     """The graph over all of the walls at once."""
-    graph = PathGraph(radius, 0.05, 0.012, SLACK)
+    graph = PathGraph(tol)
     graph.set_walls(walls, np.ones(len(walls), np.bool_), np.arange(len(walls)))
     pieces, owner = (NO_PIECES, NO_OWNER) if pieces is None else (pieces, owner)
-    graph.set_pieces(pieces, owner, ALL)
+    graph.set_pieces(pieces, np.zeros(len(pieces)), owner, ALL)
     graph.connect()
     return graph
 
@@ -151,7 +152,7 @@ def test_open_edges_block_until_they_are_gone_and_never_their_owner():
     lengths = graph.distances(leaves[0], np.array([node, beyond]))
     np.testing.assert_allclose(lengths, [math.hypot(2, 0.5), math.hypot(4, 0.5)])
     graph.remove_leaves(np.array([beyond]))
-    graph.set_pieces(NO_PIECES, NO_OWNER, ALL)
+    graph.set_pieces(NO_PIECES, np.zeros(0), NO_OWNER, ALL)
     graph.repair()
     assert graph.distances(leaves[0], leaves[1:2]) == pytest.approx(4.0)
 
@@ -161,7 +162,7 @@ def test_open_edges_block_until_they_are_gone_and_never_their_owner():
 
 def edges(graph):
     """The open edges (e, 2)."""
-    living = np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist()
+    living = np.flatnonzero(graph.vertices.kind[: graph.n_vertices] >= 0).tolist()
     pairs = [(u, int(v)) for u in living for v in graph.neighbours(u)]
     assert len(set(pairs)) == len(pairs)
     assert {(v, u) for u, v in pairs} == set(pairs), "an edge is known at one of its ends only"
@@ -171,18 +172,18 @@ def edges(graph):
 def exported(graph):
     """The living graph as networkx, leaves as dead ends seen from everywhere but themselves."""
     out = nx.Graph()
-    out.add_nodes_from(np.flatnonzero(graph.kind[: graph.n_vertices] >= 0).tolist())
+    out.add_nodes_from(np.flatnonzero(graph.vertices.kind[: graph.n_vertices] >= 0).tolist())
     for u, v in edges(graph).tolist():
         first = graph.links.first[u]
         length = float(graph.links.cost[first : first + graph.links.degree[u]][graph.neighbours(u) == v][0])
-        assert length == pytest.approx(math.dist(graph.position[u], graph.position[v]))
+        assert length == pytest.approx(math.dist(graph.vertices.position[u], graph.vertices.position[v]))
         out.add_edge(u, v, weight=length)
     return out
 
 
 def check_fields(graph):
     network = exported(graph)
-    leaves = {v for v in network if graph.kind[v] == LEAF}
+    leaves = {v for v in network if graph.vertices.kind[v] == LEAF}
     for source in graph.source_of[graph.source_of >= 0].tolist():
         reach = graph.reach[graph.row_of[source]]
         through = network.subgraph([v for v in network if v not in leaves or v == source])
@@ -224,7 +225,7 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
     rng.shuffle(rows[4:])
     alive = np.zeros(len(rows), np.bool_)
     alive[: int(rng.integers(4, 12))] = True
-    graph = PathGraph(RADIUS, 0.05, 0.012, SLACK)
+    graph = PathGraph(TOL)
     touched = np.flatnonzero(alive)
     pieces, owner = NO_PIECES, NO_OWNER
     leaves: list[int] = []
@@ -232,7 +233,9 @@ def test_fields_stay_right_through_any_sequence_of_changes(seed):
     for _ in range(25):
         graph.set_walls(rows.copy(), alive.copy(), touched)
         x, y = rng.uniform(-4, 4, 2)
-        graph.set_pieces(pieces, owner, ALL if rng.random() < 0.5 else np.array([x - 3, y - 3, x + 3, y + 3]))
+        graph.set_pieces(
+            pieces, np.zeros(len(pieces)), owner, ALL if rng.random() < 0.5 else np.array([x - 3, y - 3, x + 3, y + 3])
+        )
         graph.add_way_point(x, y)
         if rng.random() < 0.3:
             graph.add_felt(np.array([x, y, x + 0.02, y]))
@@ -292,7 +295,7 @@ def test_a_trail_laid_again_is_the_same_trail_and_leads_back():
     graph.connect()
     graph.set_sources(np.array([robot]))
     assert np.isfinite(graph.distances(robot, np.array([home]))).all()
-    laid = graph.position[(graph.kind == CORNER) & (graph.shape[:, 6] == TRAIL)]
+    laid = graph.vertices.position[(graph.vertices.kind == CORNER) & (graph.vertices.shape.limit == TRAIL)]
     assert len(laid) > 2
     assert len(np.unique(laid, axis=0)) == len(laid)
 
@@ -303,18 +306,20 @@ def test_edges_in_the_graph_keep_clear_of_walls_that_came_later():
     rows = np.vstack([box(-5, -5, 5, 5), scene("rooms", 60)[4:], scene("furnished", 1)[4:]])
     rows[4:] = rows[4:][rng.permutation(len(rows) - 4)]
     alive = np.zeros(len(rows), np.bool_)
-    graph = PathGraph(RADIUS, 0.05, 0.012, SLACK)
+    graph = PathGraph(TOL)
     for i in range(0, len(rows), 4):
         fresh = np.arange(i, min(i + 4, len(rows)))
         alive[fresh] = True
         graph.set_walls(rows, alive, fresh)
         graph.connect()
         ends = np.concatenate((edges(graph), graph.blocked))
-        ways = shapely.linestrings(np.stack((graph.position[ends[:, 0]], graph.position[ends[:, 1]]), axis=1))
+        ways = shapely.linestrings(
+            np.stack((graph.vertices.position[ends[:, 0]], graph.vertices.position[ends[:, 1]]), axis=1)
+        )
         assert (shapely.distance(lines_of(rows[alive]), ways) > RADIUS).all()
-        corners = graph.position[: graph.n_vertices][graph.kind[: graph.n_vertices] == CORNER]
+        corners = graph.vertices.position[: graph.n_vertices][graph.vertices.kind[: graph.n_vertices] == CORNER]
         clearance = shapely.distance(lines_of(rows[alive]), shapely.points(corners))
-        assert (clearance >= RADIUS + 0.012 - 0.009).all()
+        assert (clearance >= TOL.sweep - 1e-9).all()
 
 
 def test_retreat_leads_away_from_the_wall_that_was_touched():
@@ -327,10 +332,10 @@ def test_retreat_leads_away_from_the_wall_that_was_touched():
         for x, y in clear_points(rng, walls, RADIUS - 0.02, 20):
             near = lines.distance(shapely.Point(x, y))
             rx, ry, ok = graph.retreat(x, y)
-            if near >= graph.need:
+            if near >= TOL.need:
                 assert (rx, ry, ok) == (x, y, True)
             elif ok:
                 found += 1
-                assert lines.distance(shapely.Point(rx, ry)) >= graph.need - 1e-9
+                assert lines.distance(shapely.Point(rx, ry)) >= TOL.need - 1e-9
                 assert lines.distance(shapely.LineString([(x, y), (rx, ry)])) >= near - 1e-5
     assert found > 20

@@ -7,14 +7,16 @@ import math
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import star, turned
+from exploration_scenes import star, tol_of, turned
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration import scan_polygon as sp
+from polyexplore_gym.exploration.tolerances import noise_at
 from polyexplore_gym.sim.laser import cast_rays
 
 FIELDS = (0.5, 1.5, math.pi, 4.2, 6.0, 2 * math.pi)
 SENSOR = SensorConfig()
+TOL = tol_of(SENSOR)
 ANGLES = np.linspace(-math.pi / 2, math.pi / 2, 361)
 
 
@@ -111,7 +113,7 @@ def test_subtract_against_sets():
         cut = np.sort(rng.uniform(0, 1, 2 * c)).reshape(-1, 2)
         wanted = ((grid[:, None] > kept[:k, 0]) & (grid[:, None] < kept[:k, 1])).any(axis=1)
         wanted &= ~((grid[:, None] > cut[:, 0]) & (grid[:, None] < cut[:, 1])).any(axis=1)
-        n = sp.subtract(kept, k, cut, c)
+        kept, n = sp.subtract(kept, k, cut, c)
         got = ((grid[:, None] > kept[:n, 0]) & (grid[:, None] < kept[:n, 1])).any(axis=1)
         assert (got == wanted).all()
         assert (np.diff(kept[:n].ravel()) >= 0).all()
@@ -131,18 +133,28 @@ def test_open_edges_are_the_unlabelled_boundary(fov):
         arcs = labels == sp.RANGE
         arcs &= ~(np.isinf(ranges[: len(labels)]) & np.isinf(np.roll(ranges, -1)[: len(labels)]))
         labels[arcs] = sp.JUMP  # a range edge joins beams without a return
-        pieces, kinds = sp.open_edges(points, labels, 8.0, 0.8, full)
+        tol = tol_of(piece=0.8, max_range=8.0)
+        pieces, kinds, sigmas = sp.open_edges(points, labels, full, tol)
         edges = np.hstack([points, np.roll(points, -1, axis=0)])[: len(labels)]
         wanted = edges[labels != sp.WALL].reshape(-1, 2, 2)
         if not full:
             wanted = np.concatenate((wanted, [[[0, 0], points[0]], [points[-1], [0, 0]]]))
             views = pieces[kinds == sp.VIEW]
             assert np.hypot(*(views[:, 2:] - views[:, :2]).T).sum() == pytest.approx(np.hypot(*points[[0, -1]].T).sum())
-        wanted = shapely.multilinestrings(wanted)
+        parts, wanted = shapely.linestrings(wanted), shapely.multilinestrings(wanted)
         got = shapely.multilinestrings(pieces.reshape(-1, 2, 2))
         assert (np.hypot(*(pieces[:, 2:] - pieces[:, :2]).T) <= 0.8 + 1e-9).all()
         # Chords stand for arcs.
-        assert wanted.hausdorff_distance(got) < 0.031
+        assert wanted.hausdorff_distance(got) < tol.sagitta + 0.001
+        # The noise of each piece is that of the end (of a discontinuity: the nearer end) that it comes from.
+        ends = np.hypot(*np.moveaxis(shapely.get_coordinates(wanted).reshape(-1, 2, 2), 2, 0))
+        middles = shapely.points(0.5 * (pieces[:, :2] + pieces[:, 2:]))
+        for kind, sigma, mine in zip(kinds, sigmas, shapely.distance(middles[:, None], parts) < 1e-9, strict=True):
+            far = ends[mine].min(axis=1) if kind == sp.JUMP else ends[mine].max(axis=1)
+            if kind == sp.RANGE:
+                assert sigma == pytest.approx(noise_at(8.0, tol))
+            else:
+                assert np.isclose(sigma, np.hypot(tol.sigma_range, tol.sigma_angle * far)).any()
         area = shapely.Polygon(points if full else np.vstack([[0, 0], points]))
         d = pieces[:, 2:] - pieces[:, :2]
         size = np.hypot(*d.T)
@@ -163,9 +175,7 @@ def noisy(walls, rng):
 
 
 def labels_of(ranges, min_gap=0.5):
-    return sp.label_edges(
-        ANGLES, ranges, np.full(361, -1), SENSOR.max_range, SENSOR.sigma_range, SENSOR.sigma_angle, min_gap, False
-    )
+    return sp.label_edges(ranges, np.full(361, -1), False, TOL._replace(gap=min_gap))
 
 
 def test_no_false_jumps_on_a_wall():
@@ -236,5 +246,5 @@ def test_a_passage_between_two_returns_on_one_fitted_line_stays_open():
     ranges = np.full(361, 4.0)
     segment = np.zeros(361, np.int64)
     ranges[200:] = 4.6
-    labels = sp.label_edges(ANGLES, ranges, segment, 8.0, 0.01, 0.002, 0.5, False)
+    labels = sp.label_edges(ranges, segment, False, TOL)
     assert np.flatnonzero(labels == sp.JUMP).tolist() == [199]

@@ -64,18 +64,19 @@ def test_grid_answers_like_all_segments(seed):
     rng = np.random.default_rng(seed)
     segments = random_segments(rng, 60)
     alive = rng.random(60) < 0.8
-    grid = sg.build_grid(segments, alive, 0.45)
+    grid = sg.indexed(segments, np.full(60, -1), alive, 0.45, float(rng.choice([0.3, 1.0, 5.0])))
     living = lines_of(segments[alive])
     points = rng.uniform(-13, 13, (2000, 2))
-    got = np.array([sg.clearance(x, y, segments, *grid, 0.45) for x, y in points])
+    got = np.array([sg.clearance(x, y, grid, 0.45) for x, y in points])
     wanted = np.minimum(shapely.distance(living, shapely.points(points)), 0.45)
     np.testing.assert_allclose(got, wanted, atol=1e-9)
+    np.testing.assert_array_equal(sg.clearances(points, grid, 0.45), got)
 
     ways = random_segments(rng, 3000)
     distance = shapely.distance(living, line(ways))
     for radius in (0.1, 0.25, 0.45):
         sure = np.abs(distance - radius) > 1e-9
-        free = np.array([sg.sweep_free(*w, segments, *grid, radius) for w in ways])
+        free = np.array([sg.sweep_free(*w, grid, radius) for w in ways])
         assert (free == (distance >= radius))[sure].all()
         assert 50 < free.sum() < 2950
 
@@ -85,7 +86,7 @@ def test_crossing_free_with_owners_and_slack(seed):
     rng = np.random.default_rng([7, seed])
     segments = random_segments(rng, 40)
     owner = rng.integers(-1, 5, 40)
-    grid = sg.build_grid(segments, np.ones(40, np.bool_), 0.0)
+    grid = sg.indexed(segments, owner, np.ones(40, np.bool_), 0.0, 1.0)
     lines = line(segments)
     outcomes = []
     for w in random_segments(rng, 3000) + 1e-4 * np.sqrt(2):  # a way along a segment is no crossing
@@ -100,6 +101,6 @@ def test_crossing_free_with_owners_and_slack(seed):
                 near |= abs(da - slack_a) < 1e-7 or abs(db - slack_b) < 1e-7
                 blocked |= da >= slack_a and db >= slack_b
         if not near:
-            assert sg.crossing_free(*w, segments, *grid, owner, a, b, slack_a, slack_b) != blocked
+            assert sg.crossing_free(*w, grid, a, b, slack_a, slack_b) != blocked
             outcomes.append(blocked)
     assert 0.03 < np.mean(outcomes) < 0.95

@@ -247,6 +247,13 @@ def test_units_are_read_or_asked_for(dxf):
         load_plan(dxf(draw, units=6))
 
 
+def test_coordinates_of_a_survey(dxf):
+    path = dxf(lambda space, _: ring(space, [(431_200 + x, 5_073_100 + y) for x, y in box(0, 0, 8, 5)]))
+    with pytest.warns(FloorPlanWarning, match="is taken off all of them"):
+        plan = load_plan(path)
+    assert_same(plan, shapely.box(0, 0, 8, 5))
+
+
 def test_layers_and_colours_are_named(dxf):
     path = dxf(lambda space, _: (ring(space, box(0, 0, 8, 5)), ring(space, box(1, 1, 2, 2), "DOORS"))[0])
     with pytest.raises(InvalidFloorPlanError, match=r"layers 'wand': the drawing has '1', '3', 'doors', 'walls'"):

@@ -125,3 +125,13 @@ def test_units_of_lines_too(write):
     assert load_plan(path, units="cm", wall_thickness=0.1).area == pytest.approx(60 - 0.1 * 3.05)
     with pytest.warns(FloorPlanWarning, match="in cm: 10 x 6 m"):
         load_plan(path, wall_thickness=0.1)
+
+
+def test_coordinates_of_a_survey(write):
+    far = [[431_200.25 + x, 5_073_100.5 + y] for x, y in HALL]
+    path = write(feature("Polygon", [far], name="hall"), feature("Point", far[0]))
+    with pytest.warns(FloorPlanWarning, match=r"\(431200, 5.0731e\+06\) m is taken off all of them"):
+        plan = load_plan(path, wall_thickness=0.2)
+    assert plan.bounds == pytest.approx((0.25, 0.5, 10.25, 6.5))
+    assert plan.area == pytest.approx(60 - 0.01)
+    assert plan.meta["offset"] == [431_200.0, 5_073_100.0]

@@ -214,6 +214,20 @@ def test_any_maxval(tmp_path, maxval, plain):
     assert quiet(write(tmp_path, head + (body if plain else body.tobytes()))).area == pytest.approx(BOTH)
 
 
+def test_the_grey_of_map_savers_with_another_maxval(tmp_path):
+    """205 of 254 is 206 of 255, by the letter free at 0.196."""
+    image = flat()
+    head = f"P5 {image.shape[1]} {image.shape[0]} 254\n".encode()
+    with pytest.warns(FloorPlanWarning, match="grey 205 is taken for unknown"):
+        assert load_plan(write(tmp_path, head + image.tobytes())).area == pytest.approx(BOTH)
+
+
+def test_a_jpg_smears_its_greys(tmp_path):
+    with pytest.warns(FloorPlanWarning, match="grey 205 is taken for unknown"):
+        plan = load_plan(write(tmp_path, flat(), ".jpg", free_thresh=0.25))
+    assert plan.area == pytest.approx(BOTH, rel=0.02)
+
+
 @pytest.mark.parametrize("plain", [False, True])
 def test_bitmaps(tmp_path, plain):
     """In a PBM 1 is black."""

@@ -53,9 +53,9 @@ def typestore(first):
 class Bag:
     """Writes a bag of kind `bag`, `db3` or `mcap`; all times are s after START."""
 
-    def __init__(self, path: Path, kind: str):
+    def __init__(self, path: Path, kind: str, compression: str = ""):
         from rosbags.rosbag1 import Writer as Writer1
-        from rosbags.rosbag2 import StoragePlugin
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2
 
         self.kind = kind
@@ -66,6 +66,10 @@ class Bag:
         else:
             plugin = StoragePlugin.SQLITE3 if kind == "db3" else StoragePlugin.MCAP
             self.writer = Writer2(self.path, version=9, storage_plugin=plugin)
+        if compression and kind == "bag":
+            self.writer.set_compression(Writer1.CompressionFormat[compression])
+        elif compression:
+            self.writer.set_compression(CompressionMode[compression], CompressionFormat.ZSTD)
         self.connections = {}
 
     def __enter__(self):
@@ -136,12 +140,22 @@ def measured(time, pause=PAUSE, sign=1.0):
 
 
 def drive(
-    path, kind, *, scans=20, corrected=True, with_tf=True, with_odom=True, upside_down=False, pause=PAUSE, slash=""
+    path,
+    kind,
+    *,
+    scans=20,
+    corrected=True,
+    with_tf=True,
+    with_odom=True,
+    upside_down=False,
+    pause=PAUSE,
+    slash="",
+    compression="",
 ):
     """A bag of the drive: scans at 5 Hz, odometry and tf at 50 Hz."""
     mount = MOUNT
     times = np.arange(0.0, scans / 5 + 0.3, 0.02)
-    with Bag(path, kind) as bag:
+    with Bag(path, kind, compression) as bag:
         if with_tf:
             bag.tf(
                 0.0, bag.transform(0.0, f"{slash}base_link", f"{slash}laser", mount, upside_down), topic="/tf_static"

@@ -50,6 +50,18 @@ def test_scans_and_both_poses_are_read(tmp_path, kind):
     assert log.beam_times[3][-1] == pytest.approx(5e-4 * (BEAMS - 1))
 
 
+@pytest.mark.parametrize(
+    ("kind", "compression"),
+    [("bag", "BZ2"), ("bag", "LZ4"), ("db3", "FILE"), ("db3", "MESSAGE"), ("mcap", "FILE"), ("mcap", "MESSAGE")],
+)
+def test_compressed_bags(tmp_path, kind, compression):
+    path = drive(tmp_path / "a", kind, scans=3, compression=compression)
+    whole = read_log(drive(tmp_path / "b", kind, scans=3))
+    log = read_log(path)
+    np.testing.assert_array_equal(log.ranges, whole.ranges)
+    np.testing.assert_allclose(log.poses, whole.poses, atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_scans_taken_on_the_move_are_straightened(tmp_path, kind):
     log = read_log(drive(tmp_path / "a", kind))

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from line_scenes import HALF, box, cast, distance, measure
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.errors import InvalidConfigError, InvalidLogError, MissingDependencyError, RenderingError
+from polyexplore_gym.floorplan import load_plan
 from polyexplore_gym.mapping import MAP_SUFFIXES, LaserLog, LineMap, map_log, read_log, save_map, sensor_of
 from polyexplore_gym.mapping.evidence import BIN, BINS, OBLIQUE, Counts, confirmed, count, pieces_of
+from polyexplore_gym.mapping.export import occupancy
 from polyexplore_gym.mapping.log_map import MISFIT
 from polyexplore_gym.mapping.logs.poses import between, compose
 
@@ -268,8 +271,6 @@ def test_json_holds_the_map(made, tmp_path):
 
 
 def test_geojson_is_read_by_shapely(made, tmp_path):
-    import shapely
-
     save_map(made, tmp_path / "a.geojson")
     text = (tmp_path / "a.geojson").read_text()
     features = json.loads(text)["features"]
@@ -296,6 +297,42 @@ def test_pictures_show_the_walls(made, tmp_path):
     svg = (tmp_path / "a.svg").read_text()
     assert "rooms" in svg
     assert f"{made.rho.size} lines" in svg
+
+
+def test_a_robot_map_shows_walls_and_what_beams_passed(made, tmp_path):
+    save_map(made, tmp_path / "a.yaml", name="rooms")
+    plan = load_plan(tmp_path / "a.yaml", radius=0.25)
+    assert plan.name == "a"
+    # Walls are a pixel of 5 cm thick, and beams fan out: a little is missing along the walls.
+    rooms = shapely.box(0.0, 0.0, 8.0, 4.0)
+    assert plan.polygon.difference(rooms.buffer(0.06)).area < 0.01
+    assert plan.area > 0.93 * rooms.area
+    for y in (0.3, 0.8, 1.3, 2.7, 3.5):
+        assert not plan.polygon.contains(shapely.LineString([[3.8, y], [4.2, y]]))
+    assert plan.polygon.contains(shapely.LineString([[3.5, 2.0], [4.5, 2.0]]))
+
+
+def test_the_pixels_of_a_robot_map_by_a_plain_twin(made):
+    image, corner = occupancy(made, 0.1)
+
+    def pixel(point):
+        column, up = np.floor((point - corner) / 0.1).astype(int)
+        return image.shape[0] - 1 - up, column
+
+    walls = np.concatenate([made.segments, made.fragments]).reshape(-1, 2, 2)
+    assert all(image[pixel(end)] == 0 for ends in walls for end in ends)
+    # Off the walls every beam is free all along.
+    rng = np.random.default_rng(0)
+    for i in rng.integers(0, len(made.points), 200):
+        a, b = made.path[made.point_scan[i], :2], made.points[i]
+        for share in (0.0, 0.3, 0.6, 0.9):
+            point = a + share * (b - a)
+            if distance(point[None], walls.reshape(-1, 4)).min() > 0.25:
+                row, column = pixel(point)
+                assert (image[row - 1 : row + 2, column - 1 : column + 2] == 254).any()
+    # And what no beam came near is unknown.
+    assert (image[[0, -1]] == 205).all()
+    assert (image[:, [0, -1]] == 205).all()
 
 
 def test_a_log_without_walls_gives_an_empty_map(tmp_path):

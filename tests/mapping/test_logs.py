@@ -188,6 +188,14 @@ def test_the_field_of_view_of_flaser(write):
     np.testing.assert_allclose(np.degrees(log.angles[0]), [-90, 0, 90], atol=1e-12)
 
 
+def test_a_guessed_field_of_view_is_told_of(write):
+    for size, told in ((180, 0), (181, 0), (361, 0), (541, 1), (1081, 1)):
+        path = write(flaser([2.0] * size, SCAN[1]))
+        assert len(read_log(path).notes) == told
+        assert not read_log(path, field_of_view=4.7).notes
+    assert "541 beams" in read_log(write(flaser([2.0] * 541, SCAN[1]))).notes[0]
+
+
 def test_a_laser_that_turns_clockwise(write):
     log = read_log(write(robotlaser([1.0, 2.0, 3.0, 4.0], SCAN[1], start=1.0, step=-0.5)))
     np.testing.assert_allclose(log.angles[0], [-0.5, 0.0, 0.5, 1.0])

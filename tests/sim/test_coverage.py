@@ -203,8 +203,8 @@ def test_side_of_a_line_is_exact() -> None:
 def test_spacing_follows_the_robot_and_is_bounded_by_the_area() -> None:
     assert grid_spacing(0.25, 100.0) == pytest.approx(0.2)
     assert grid_spacing(0.05, 100.0) == pytest.approx(0.04)
-    square = FloorPlan.create([[0, 0], [2000, 0], [2000, 2000], [0, 2000]])
-    points = grid_points(square.segments, grid_spacing(0.25, square.area))
+    square = shapely.box(0.0, 0.0, 2000.0, 2000.0)  # more than a plan may have
+    points = grid_points(walls_of(square), grid_spacing(0.25, square.area))
     assert len(points) == pytest.approx(MOST_POINTS, rel=0.01)
     # A disc of the robot's size holds sample points wherever it stands.
     rng = np.random.default_rng(0)

@@ -39,6 +39,8 @@ GIVE_UP = 10_000
 """So many broken lines before the first scan, and the file is no log."""
 CODES = 80.0
 """SICK lasers write error codes as ranges of 81.83 m and more; their range ends at 80 m."""
+SICK = 90, 180, 360, 720
+"""Beams of lasers with a field of view of 180 degrees, one more or less."""
 ROUNDING = 1e-6
 """Angular resolutions are written with six decimals, rad."""
 MOUNTS = {"robot_frontlaser_offset": 0, "robot_frontlaser_side_offset": 1, "robot_frontlaser_angular_offset": 2}
@@ -124,6 +126,7 @@ def read_carmen(
         broken=tuple(Broken(f"line {line}", reason) for line, reason in sorted(found.broken)),
         unread={name: count for name, count in total.items() if name != message},
         read=message,
+        notes=_notes(kept[0].beams, field_of_view),
     )
 
 
@@ -268,6 +271,13 @@ def _flaser(behind: int, count: int, field_of_view: float | None) -> _Beams:
     else:
         start, step = -field_of_view / 2, field_of_view / (count - 1)
     return _Beams("FLASER", behind, count, start, step, None)
+
+
+def _notes(beams: _Beams, field_of_view: float | None) -> tuple[str, ...]:
+    """What is guessed of the beams."""
+    if beams.message != "FLASER" or field_of_view is not None or min(abs(beams.size - n) for n in SICK) <= 1:
+        return ()
+    return (f"FLASER does not say how its {beams.size} beams lie: a field of view of 180 degrees is assumed",)
 
 
 def _laser(message: str, behind: int, count: int, settings: np.ndarray) -> _Beams:

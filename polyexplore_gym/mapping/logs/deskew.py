@@ -43,7 +43,8 @@ def _at_once(
     moved = between(track.at(np.array([time])), track.at(time + after))
     turned = angles + moved[:, 2]
     hit = np.isfinite(ranges)
-    ends = compose(moved[hit], np.stack([ranges * np.cos(angles), ranges * np.sin(angles), 0.0 * angles], axis=1)[hit])
+    r, a = ranges[hit], angles[hit]
+    ends = compose(moved[hit], np.stack([r * np.cos(a), r * np.sin(a), np.zeros(r.size)], axis=1))
     out = ranges.copy()
     out[hit] = np.hypot(ends[:, 0], ends[:, 1])
     bearing = np.arctan2(ends[:, 1], ends[:, 0])

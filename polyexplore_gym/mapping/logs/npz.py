@@ -30,6 +30,8 @@ from polyexplore_gym.mapping.logs.record import (
 )
 
 KEYS = ("angles", "ranges", "poses", "max_range", "pose_covariance", "odometry", "times", "time_increment")
+LARGEST = 1e6
+"""A larger variance of a pose is none, m2 or rad2."""
 LONGEST = 2.0
 """A scan that takes longer is not one, s."""
 
@@ -118,9 +120,11 @@ def _times(arrays: dict[str, np.ndarray], n: int, order: np.ndarray) -> tuple[np
 def _covariances(given: np.ndarray, n: int) -> np.ndarray:
     if given.shape not in ((3, 3), (n, 3, 3)):
         raise InvalidLogError(f"pose_covariance: expected (3, 3) or ({n}, 3, 3), got {given.shape}")
-    symmetric = np.isfinite(given).all() and np.allclose(given, np.swapaxes(given, -1, -2))
+    if not (np.abs(given) <= LARGEST).all():
+        raise InvalidLogError(f"pose_covariance: must be finite, and {LARGEST:g} at most")
+    symmetric = np.allclose(given, np.swapaxes(given, -1, -2))
     if not (symmetric and np.linalg.eigvalsh(given).min() >= -1e-9):
-        raise InvalidLogError("pose_covariance: must be finite, symmetric and not negative")
+        raise InvalidLogError("pose_covariance: must be symmetric and not negative")
     return np.broadcast_to(given, (n, 3, 3))
 
 

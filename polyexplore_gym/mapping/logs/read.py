@@ -10,7 +10,7 @@ import numpy as np
 from polyexplore_gym.errors import InvalidLogError
 from polyexplore_gym.mapping.logs.carmen import read_carmen
 from polyexplore_gym.mapping.logs.npz import read_npz
-from polyexplore_gym.mapping.logs.record import LaserLog
+from polyexplore_gym.mapping.logs.record import FARTHEST, LaserLog
 from polyexplore_gym.mapping.logs.ros import BAG, MCAP, SQLITE, read_bag
 from polyexplore_gym.mapping.logs.trajectory import read_trajectory, with_trajectory
 
@@ -92,7 +92,7 @@ def check_readings(log: LaserLog) -> None:
     readings = np.concatenate(log.ranges)
     if np.isnan(readings).all():
         raise InvalidLogError(f"{log.read}: no reading in {len(log)} scans: all ranges are zero, negative or NaN")
-    finite = readings[np.isfinite(readings)]
+    finite = np.minimum(readings[np.isfinite(readings)], FARTHEST)
     if not finite.size:
         return
     limit = np.inf if log.max_range is None else log.max_range
