@@ -313,7 +313,7 @@ def case_of(number: int) -> Case:
     size = scale if with_robot else 1.0
     values: dict[str, Any] = {
         "sensor": {
-            "beams": int(np.exp(rng.uniform(math.log(20.0), math.log(2000.0)))),
+            "beams": max(int(np.exp(rng.uniform(math.log(20.0), math.log(2000.0)))), math.ceil(view / 15.0) + 1),
             "field_of_view": math.radians(view),
             "max_range": reach,
             "sigma_range": 0.01 * noise * min(scale, 1.0 if not with_robot else scale),
