@@ -144,6 +144,10 @@ class ExplorationMap:
         """Openings narrower than this are no jump edges: the robot's diameter, less what noise may take off."""
         n = sensor.beams
         self.n_scans = 0
+        """Scan polygons kept: those that showed something new."""
+        self.n_looks = 0
+        """All scans so far."""
+        self._looks = np.zeros((16, 3))
         self._apexes = np.zeros((16, 2))
         self._headings = np.zeros(16)
         self._points = np.zeros((16, n, 2))
@@ -196,6 +200,7 @@ class ExplorationMap:
         ranges = scan.ranges if ranges is None else ranges
         if point_segment is None:
             point_segment = np.full(len(scan.angles), -1, np.int64)
+        self._remember(scan.pose)
         s = self._store(scan, ranges)
         scans, tol, full = self.scans, self.tol, self.sensor.full_circle
         x, y = float(scan.pose[0]), float(scan.pose[1])
@@ -229,7 +234,10 @@ class ExplorationMap:
         p = p._replace(visits=visits)
         left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
         new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
-        self._rechain(p, dirty, local, left, new, near_walls)
+        if not len(fresh) and not changed.any():
+            self.n_scans -= 1  # its polygon lies within the others: kept, it would only cost memory
+        if len(fresh) or dirty.any():
+            self._rechain(p, dirty, local, left, new, near_walls)
         if target is not None:
             self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
@@ -248,6 +256,12 @@ class ExplorationMap:
     @property
     def _front(self) -> float:
         return self.tol.front if self.config.placement == "in_front" else 0.0
+
+    def _remember(self, pose: np.ndarray) -> None:
+        if self.n_looks == len(self._looks):
+            self._looks = np.concatenate((self._looks, np.zeros_like(self._looks)))
+        self._looks[self.n_looks] = pose
+        self.n_looks += 1
 
     def _store(self, scan: Scan, ranges: np.ndarray) -> int:
         s = self.n_scans
@@ -415,7 +429,7 @@ class ExplorationMap:
         if not self.reachable.any():
             # What is left lies behind slivers of the unknown: look at it across them.
             self._place_within(np.arange(c.size), through_unknown=True)
-        nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.tol, c.gain)
+        nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.config.gain == "visible", self.tol, c.gain)
         g.recycle()
 
     def _look_again(self) -> bool:
@@ -490,11 +504,12 @@ class ExplorationMap:
             return
         g, c = self.graph, self.chains
         seen = np.isfinite(g.distances(self.robot, np.arange(g.n_vertices)))
+        looks, half_view = self._looks[: self.n_looks], 0.5 * self.sensor.field_of_view
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
         for k, i in enumerate(which):
             *node[k], found[k] = nodes.nearest_reachable(
-                np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, self.scans, g.walls, g.pieces,
-                self.tol, through_unknown,
+                np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, looks, half_view, g.walls,
+                g.pieces, self.tol, through_unknown,
             )  # fmt: skip
         if found.any():
             self._drop_vertices(c.vertex[which[found]])
