@@ -41,7 +41,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     A plan seen whole from the start terminates in the first step, whatever the action, at no cost.
 
     Version history: v0, the first. v1: openings instead of chains, a look counts only where it could have shown
-    something, paths through tight doorways, lengths that follow from robot and sensor, swept contact; `info["outcome"]`.
+    something, paths through tight doorways, lengths from robot and sensor, swept contact; `info["outcome"]`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # type: ignore[misc]

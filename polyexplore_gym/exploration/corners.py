@@ -136,7 +136,8 @@ def _in_narrows(ex, ey, ux, uy, walls, tol):
             room = c
             best = d
         d += step
-    while room < tol.stand and step > 0.002 * tol.radius:
+    # A step changes the clearance by its length at most: no use where even that is too little.
+    while room < tol.stand and room + step >= tol.need and step > 0.002 * tol.radius:
         step *= 0.5
         for side in (-step, step):
             d = best + side
@@ -154,33 +155,30 @@ def _across(ex, ey, walls, tol):
     It lies at least two `tol.need` away, and the middle between is nearer to no other wall.
     """
     segments = walls.segments
-    best = widest = _NARROW * tol.radius
+    best = _NARROW * tol.radius  # less than the grid's margin: all that counts stands in the end's own cell
     fx = 0.0
     fy = 0.0
     found = False
-    reach = math.ceil(widest / walls.cell)
-    for ix in range(-reach, reach + 1):
-        for iy in range(-reach, reach + 1):
-            b = bucket_at(ex + ix * walls.cell, ey + iy * walls.cell, walls)
-            for k in range(walls.start[b], walls.start[b + 1]):
-                i = walls.items[k]
-                dx = segments[i, 2] - segments[i, 0]
-                dy = segments[i, 3] - segments[i, 1]
-                q = dx * dx + dy * dy
-                t = 0.0
-                if q > 0.0:
-                    t = min(max(((ex - segments[i, 0]) * dx + (ey - segments[i, 1]) * dy) / q, 0.0), 1.0)
-                x = segments[i, 0] + t * dx
-                y = segments[i, 1] + t * dy
-                d = norm(x - ex, y - ey)
-                if (
-                    2.0 * tol.sweep <= d < best
-                    and clearance(0.5 * (x + ex), 0.5 * (y + ey), walls, tol.reach) >= 0.5 * d - 0.1 * tol.still
-                ):
-                    best = d
-                    fx = x
-                    fy = y
-                    found = True
+    b = bucket_at(ex, ey, walls)
+    for k in range(walls.start[b], walls.start[b + 1]):
+        i = walls.items[k]
+        dx = segments[i, 2] - segments[i, 0]
+        dy = segments[i, 3] - segments[i, 1]
+        q = dx * dx + dy * dy
+        t = 0.0
+        if q > 0.0:
+            t = min(max(((ex - segments[i, 0]) * dx + (ey - segments[i, 1]) * dy) / q, 0.0), 1.0)
+        x = segments[i, 0] + t * dx
+        y = segments[i, 1] + t * dy
+        d = norm(x - ex, y - ey)
+        if (
+            2.0 * tol.sweep <= d < best
+            and clearance(0.5 * (x + ex), 0.5 * (y + ey), walls, tol.reach) >= 0.5 * d - 0.1 * tol.still
+        ):
+            best = d
+            fx = x
+            fy = y
+            found = True
     return fx, fy, found
 
 

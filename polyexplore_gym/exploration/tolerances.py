@@ -56,7 +56,7 @@ class Tolerances(NamedTuple):
     still: float
     """a wall whose ends moved less since it was looked at has not moved, and cuts no edge: else paths flicker"""
     reach: float
-    """no clearance beyond it is ever asked for: more than that of a vertex in a narrow passage"""
+    """no clearance beyond it is ever asked for, nothing farther is looked for across a narrow passage"""
     cell: float
     """side of a cell of the spatial index: speed only"""
     slack: float
@@ -137,7 +137,7 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
         sweep=1.0096 * r,
         stand=1.048 * r,
         still=0.008 * r,
-        reach=1.8 * r,
+        reach=2.4 * r,
         cell=max(4.0 * r, reach / 32.0),
         slack=1.2 * r,
         neighbourhood=r,
