@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-LEVELS = 12  # cells of 1 m to 2 km
+LEVELS = 12  # cells of one unit to 2,048 units
 MOST_CELLS = 4096.0  # a box over more cells of a level is compared with every row instead
 
 
@@ -28,9 +28,11 @@ class Grid(NamedTuple):
     """(rows, 3) level and cell of each row."""
     occupied: np.ndarray
     """(LEVELS,) number of rows on each level."""
+    unit: float
+    """side of the smallest cells, m: a typical short wall"""
 
 
-def empty_grid(rows: int) -> Grid:
+def empty_grid(rows: int, unit: float = 1.0) -> Grid:
     """An empty index with room for so many rows."""
     buckets = 1 << max(8, (2 * rows - 1).bit_length())
     return Grid(
@@ -40,6 +42,7 @@ def empty_grid(rows: int) -> Grid:
         np.full(rows, -1, np.int64),
         np.zeros((rows, 3), np.int64),
         np.zeros(LEVELS, np.int64),
+        unit,
     )
 
 
@@ -69,7 +72,7 @@ def grid_put(grid: Grid, row: int, x1: float, y1: float, x2: float, y2: float) -
     """Insert a row, or move it to where it lies now."""
     grid_remove(grid, row)
     extent = max(abs(x2 - x1), abs(y2 - y1))
-    level, size = 0, 1.0
+    level, size = 0, grid.unit
     while size < extent and level < LEVELS - 1:
         level += 1
         size *= 2.0
@@ -87,7 +90,7 @@ def grid_put(grid: Grid, row: int, x1: float, y1: float, x2: float, y2: float) -
 def grid_query(grid: Grid, x0: float, y0: float, x1: float, y1: float, out: np.ndarray) -> int:
     """Write the rows whose segments may meet the box to out (large enough for all rows); returns their number."""
     count = 0
-    size = 0.5
+    size = 0.5 * grid.unit
     for level in range(LEVELS):
         size *= 2.0
         if grid.occupied[level] == 0:

@@ -44,7 +44,7 @@ class LineMap:
         self._var_angle = max(self.sensor.sigma_angle, LEAST_ANGLE_NOISE) ** 2
         self._row_count = self._line_count = 0
         self._rows, self._lines = _rows(256), _lines(128)
-        self._grid = empty_grid(256)
+        self._grid = empty_grid(256, 2.0 * self._door)
         self._slots = Slots(
             np.empty(256, np.int64),
             np.empty(128, np.int64),
@@ -88,6 +88,11 @@ class LineMap:
         if used.size:
             self._line_count += int(used[-1]) + 1
         return touched
+
+    @property
+    def door(self) -> float:
+        """Width of a door, m: the unit of lengths that decide in the map."""
+        return self._door
 
     @property
     def segments(self) -> np.ndarray:
@@ -166,7 +171,7 @@ class LineMap:
         )
         self._release(old_rows, new_rows, old_lines, new_lines)
         if new_rows > old_rows:
-            self._grid = empty_grid(new_rows)
+            self._grid = empty_grid(new_rows, 2.0 * self._door)
             for row in np.flatnonzero(self._rows.alive).tolist():
                 grid_put(self._grid, row, *self._rows.segments[row])
 

@@ -51,17 +51,18 @@ GATE = 9.21
 """A match must pass this chi-square gate (2 degrees of freedom, 99 %)."""
 RIVAL_GATE = 18.4
 """Another line that passes this gate (99.99 %) makes the match ambiguous, unless both stand for one wall."""
-SAME_OFFSET, SAME_TURN = 0.04, 0.05
-"""Two lines of the map that differ by less than this (m, rad) at the place in question stand for one wall."""
-LEAST_LENGTH = 1.0
-"""Shorter walls are left out of account, m: with few returns a corner easily tilts them more than they say."""
-OVERLAP = 0.2
-"""Least overlap of two segments that are compared, m."""
-BIAS = (0.001, 0.002)
-"""What a scan's line may be off beside what its covariance says (rad, m): returns of door frames and corners that the
+# Lengths are shares of a door's width.
+SAME_OFFSET, SAME_TURN = 0.08, 0.05
+"""Two lines of the map that differ by less than this (offset, rad) at the place in question stand for one wall."""
+LEAST_LENGTH = 2.0
+"""Shorter walls are left out of account: with few returns a corner easily tilts them more than they say."""
+OVERLAP = 0.4
+"""Least overlap of two segments that are compared."""
+BIAS = (0.001, 0.004)
+"""What a scan's line may be off beside what its covariance says (rad, offset): returns of door frames and corners that the
 fit cannot tell from the wall's, and walls a few centimetres apart that became one. Found on validation plans."""
-FARTHEST = 1.5
-"""Walls farther from where they are expected are not looked for, m."""
+NEAREST, FARTHEST = 0.2, 3.0
+"""Walls are looked for so far from where they are expected at least, and at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +128,8 @@ class Localizer:
             covariance: (3, 3) of the prediction: that of the last correction, moved on.
         """
         pose, covariance = pose.copy(), covariance.copy()
-        scanned = lines.covariance + np.diag(np.square(BIAS))
+        door = line_map.door
+        scanned = lines.covariance + np.diag(np.square((BIAS[0], BIAS[1] * door)))
         known = self._fused.shape[0]
         _carry(self._shared, pose[0] - self._pose[0], pose[1] - self._pose[1])
         matched, noise = np.full(lines.rho.size, -1, np.int64), np.zeros((lines.rho.size, 3, 2))
@@ -135,11 +137,12 @@ class Localizer:
             length = np.hypot(*(lines.segments[:, 2:] - lines.segments[:, :2]).T)
             length = np.bincount(lines.segment_line, length, lines.rho.size)
             order = np.argsort(-length, kind="stable")
-            order = order[length[order] >= LEAST_LENGTH]
+            order = order[length[order] >= LEAST_LENGTH * door]
             rows, table, grid, scratch = line_map.tables
             _correct(
                 order, lines.rho, lines.alpha, scanned, lines.segments, lines.segment_line, pose, covariance,
                 self._shared, self._lines, rows, table, grid, scratch, matched, noise,
+                door,
             )  # fmt: skip
             seen = np.unique(matched[matched >= 0])
             if seen.size:
@@ -258,7 +261,7 @@ def _length(j: int, rows: Rows, table: Lines) -> float:
 def _match(
     i: int, rho: np.ndarray, alpha: np.ndarray, covariance: np.ndarray, segments: np.ndarray, of: np.ndarray,
     pose: np.ndarray, p: np.ndarray, shared: np.ndarray, lines: np.ndarray, rows: Rows, table: Lines, grid: Grid,
-    found: np.ndarray,
+    found: np.ndarray, door: float,
 ) -> int:  # fmt: skip
     """The map's line that scan line i shows: seen from the same side, overlapping, within the gate, without a rival."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -276,16 +279,16 @@ def _match(
             x, y = segments[k, 2 * e], segments[k, 2 * e + 1]
             placed[2 * e], placed[2 * e + 1] = pose[0] + c * x - s * y, pose[1] + s * x + c * y
             far = max(far, math.hypot(x, y))
-        reach = min(0.1 + 4.0 * (sigma + far * math.sqrt(p[2, 2])), FARTHEST)
+        reach = min(NEAREST * door + 4.0 * (sigma + far * math.sqrt(p[2, 2])), FARTHEST * door)
         for q in range(box_query(grid, placed, reach, found)):
             j = rows.line[found[q]]
             if j < 0 or j in (best, rival):
                 continue
             row = rows.segments[found[q]]
-            if interval_gap(placed, row, ux, uy) > -OVERLAP:
+            if interval_gap(placed, row, ux, uy) > -OVERLAP * door:
                 continue
             _, alpha_j, _ = oriented(table, j)
-            if abs(wrap(alpha_0 - alpha_j)) > MAX_TURN or _length(j, rows, table) < LEAST_LENGTH:
+            if abs(wrap(alpha_0 - alpha_j)) > MAX_TURN or _length(j, rows, table) < LEAST_LENGTH * door:
                 continue
             _, _, _, _, d2 = _innovation(rho[i], alpha[i], covariance[i], j, pose, p, shared, lines, table)
             x, y = 0.5 * (placed[0] + placed[2]), 0.5 * (placed[1] + placed[3])
@@ -301,7 +304,7 @@ def _match(
         rho_b, alpha_b, _ = oriented(table, rival)
         a = rho_a - rival_x * math.cos(alpha_a) - rival_y * math.sin(alpha_a)
         b = rho_b - rival_x * math.cos(alpha_b) - rival_y * math.sin(alpha_b)
-        if abs(a - b) > SAME_OFFSET or abs(wrap(alpha_a - alpha_b)) > SAME_TURN:
+        if abs(a - b) > SAME_OFFSET * door or abs(wrap(alpha_a - alpha_b)) > SAME_TURN:
             return -1
     return best
 
@@ -310,7 +313,7 @@ def _match(
 def _correct(
     order: np.ndarray, rho: np.ndarray, alpha: np.ndarray, covariance: np.ndarray, segments: np.ndarray,
     of: np.ndarray, pose: np.ndarray, p: np.ndarray, shared: np.ndarray, lines: np.ndarray, rows: Rows, table: Lines,
-    grid: Grid, found: np.ndarray, matched: np.ndarray, noise: np.ndarray,
+    grid: Grid, found: np.ndarray, matched: np.ndarray, noise: np.ndarray, door: float,
 ) -> None:  # fmt: skip
     """Match and correct line by line, the longest first, so that each match is judged by what the earlier ones gave.
 
@@ -320,7 +323,7 @@ def _correct(
         i = order[q % order.size]
         if matched[i] >= 0:
             continue
-        j = _match(i, rho, alpha, covariance, segments, of, pose, p, shared, lines, rows, table, grid, found)
+        j = _match(i, rho, alpha, covariance, segments, of, pose, p, shared, lines, rows, table, grid, found, door)
         if j < 0:
             continue
         v, s, by_pose, by_line, _ = _innovation(rho[i], alpha[i], covariance[i], j, pose, p, shared, lines, table)
