@@ -59,8 +59,8 @@ LEAST_LENGTH = 2.0
 OVERLAP = 0.4
 """Least overlap of two segments that are compared."""
 BIAS = (0.001, 0.004)
-"""What a scan's line may be off beside what its covariance says (rad, offset): returns of door frames and corners that the
-fit cannot tell from the wall's, and walls a few centimetres apart that became one. Found on validation plans."""
+"""What a scan's line may be off beside what its covariance says (rad, offset): returns of door frames and corners that
+the fit cannot tell from the wall's, and walls a few centimetres apart that became one. Found on validation plans."""
 NEAREST, FARTHEST = 0.2, 3.0
 """Walls are looked for so far from where they are expected at least, and at most."""
 
