@@ -12,8 +12,9 @@ from polyexplore_gym.sim.robot import SKIN, bounded, walls_near
 
 _PIECES = 256
 """Steps of the engine that one time step takes at most; what is left then is lost to the walls."""
-_ITERATIONS = 100
-"""Passes of pymunk's solver over the contacts. In a corner of 20 degrees they leave a millionth of the speed."""
+_ITERATIONS = 20
+"""Passes of pymunk's solver over the contacts: enough for two walls at 60 degrees or more; sharper corners take several
+steps, or the swept answer."""
 _OFF = 1e-9
 """pymunk must put the body where its velocity leads, give or take this, radii."""
 
@@ -26,7 +27,8 @@ class Engine:
     the commanded velocity, without slip, and walls take what leads into them, without friction or bounce. How far the
     body may go with that velocity is bounded by a sweep (`bounded`), and where pymunk's answer is not within bounds the
     swept one is taken. So the disc overlaps no wall and passes none, whatever its speed, and nothing is left to push
-    out of a wall: that is switched off, for its velocity would throw the robot.
+    out of a wall: that is switched off, for its velocity would throw the robot. A disc that nothing rubs turns as its
+    wheels turn it, so its heading needs no engine.
 
     Every engine step has the length of a time step, because pymunk begins with the impulses of the one before and
     scales them by their lengths; the velocity is that by which the body gets to the next contact in that time.
@@ -44,35 +46,39 @@ class Engine:
         self.space.add(self.body, shape)
         self._radius, self._walls = robot.radius, walls
         self._known: set[int] = set()
+        self._x = self._y = self._half = -math.inf  # the square whose walls are at hand, by its middle and half a side
+        self._near = walls
 
-    def step(self, state: np.ndarray, step: float) -> np.ndarray:
-        """One time step (s) from a state (5,): pose, commanded speed (m/s) and turn rate (rad/s).
+    def step(self, state: np.ndarray, step: float) -> list[tuple[float, float]]:
+        """One time step (s) from a state (4 or more,): pose, and the speed commanded (m/s).
 
-        Returns the poses (n, 3) on the way where it bends, n >= 1, the last the end of the step.
+        Returns the points (m) at which the way bends, at least one, the last the end of the step.
         """
-        x, y, heading, speed, rate = map(float, state)
-        wish = speed * math.cos(heading) * step, speed * math.sin(heading) * step
-        walls = self._near(x, y, speed * step)
-        self.body.position, self.body.angle = (x, y), heading
-        self._advance(x, y, (0.0, 0.0), 0.0, wish, step)  # on the spot: the walls that it touches already
-        rows, left, pieces = [], 1.0, 0
-        while left > 0.0:
+        x, y, heading, speed = state[:4].tolist()
+        wish_x, wish_y = speed * math.cos(heading) * step, speed * math.sin(heading) * step
+        self._look_around(x, y, speed * step + self._radius * (1.0 + 4.0 * SKIN))
+        self.body.position = x, y
+        self._advance(x, y, 0.0, 0.0, wish_x, wish_y, step)  # on the spot: the walls that it touches already
+        way, left = [], 1.0
+        for _ in range(_PIECES):
             vx, vy = self.body.velocity
-            mx, my, share = bounded(walls, x, y, *wish, vx * step, vy * step, left, self._radius)
-            pieces += 1
-            if pieces == _PIECES:
-                mx, my, share = 0.0, 0.0, left
-            x, y = self._advance(x, y, (mx, my), share * rate, wish, step)
+            mx, my, share = bounded(self._near, x, y, wish_x, wish_y, vx * step, vy * step, left, self._radius)
+            if mx == 0.0 and my == 0.0:
+                break
+            x, y = self._advance(x, y, mx, my, wish_x, wish_y, step)
+            way.append((x, y))
             left -= share
-            if not rows or (mx, my) != (0.0, 0.0):
-                rows.append((x, y, heading))
-        rows[-1] = x, y, self.body.angle
-        return np.array(rows)
+            if left <= 0.0:
+                break
+        return way or [(x, y)]
 
-    def _near(self, x: float, y: float, moved: float) -> np.ndarray:
-        """Walls (W, 4) in reach of a step of so many metres; they are in the space from now on."""
-        reach = moved + self._radius * (1.0 + 4.0 * SKIN)
-        near = walls_near(self._walls, x - reach, y - reach, x + reach, y + reach)
+    def _look_around(self, x: float, y: float, reach: float) -> None:
+        """Have the walls at hand, and in the space, that lie within reach (m) of (x, y)."""
+        if max(abs(x - self._x), abs(y - self._y)) + reach <= self._half:
+            return
+        self._x, self._y, self._half = x, y, reach + self._radius
+        near = walls_near(self._walls, x - self._half, y - self._half, x + self._half, y + self._half)
+        self._near = self._walls[near]
         for k in near.tolist():
             if k not in self._known:
                 x1, y1, x2, y2 = self._walls[k].tolist()
@@ -80,23 +86,21 @@ class Engine:
                 wall.friction = wall.elasticity = 0.0
                 self.space.add(wall)
                 self._known.add(k)
-        return self._walls[near]
 
     def _advance(
-        self, x: float, y: float, motion: tuple[float, float], rate: float, wish: tuple[float, float], step: float
+        self, x: float, y: float, mx: float, my: float, wish_x: float, wish_y: float, step: float
     ) -> tuple[float, float]:
-        """One step of the engine from (x, y) by a motion (m), turning at a rate (rad/s); returns the end.
+        """One step of the engine from (x, y) by a motion (m); returns the end.
 
         The body's velocity is then what the walls at the end leave of the wish (m).
         """
-        body = self.body
-        end = x + motion[0], y + motion[1]
-        push = body.mass / (step * step)
-        body.velocity, body.angular_velocity = (motion[0] / step, motion[1] / step), rate
-        body.force = (wish[0] - motion[0]) * push, (wish[1] - motion[1]) * push  # the wheels
+        body, push = self.body, self.body.mass / (step * step)
+        body.velocity = mx / step, my / step
+        body.force = (wish_x - mx) * push, (wish_y - my) * push  # the wheels
         self.space.step(step)
         got_x, got_y = body.position
-        if not max(abs(got_x - end[0]), abs(got_y - end[1])) <= _OFF * self._radius:
-            body.position = end
-            return end
-        return got_x, got_y
+        end_x, end_y = x + mx, y + my
+        if max(abs(got_x - end_x), abs(got_y - end_y)) <= _OFF * self._radius:
+            return got_x, got_y
+        body.position = end_x, end_y
+        return end_x, end_y

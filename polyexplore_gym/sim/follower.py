@@ -218,8 +218,8 @@ def forget(state, progress):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def feel(state, x, y, heading, acceleration, step, radius):  # type: ignore[no-untyped-def]
-    """Take over the pose in which a step among walls ended, and what they took of the motion commanded.
+def feel(state, x, y, acceleration, step, radius):  # type: ignore[no-untyped-def]
+    """Take over where a step among walls ended, and what they took of the motion commanded.
 
     acceleration m/s2 is what the wheels go on with where a wall holds them.
     """
@@ -232,7 +232,7 @@ def feel(state, x, y, heading, acceleration, step, radius):  # type: ignore[no-u
         state[MET] = 1.0
         state[SPEED] = max(progress / step, min(state[SPEED], acceleration * max(_STALL - step, 0.0)))
     forget(state, progress)
-    state[X], state[Y], state[HEADING] = x, y, _wrap(heading)
+    state[X], state[Y], state[HEADING] = x, y, _wrap(state[HEADING] + state[RATE] * step)
     if state[DEFICIT] > _BUMP * radius:
         state[PHASE] = BUMP
 

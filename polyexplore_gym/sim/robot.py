@@ -21,8 +21,6 @@ SKIN = 1e-7
 far it touches."""
 _ARC = 0.05
 """Round the end of a wall a disc slides in pieces of this length, in radii; it strays outwards by half its square."""
-_LONGER = 1e-12
-"""Share by which rounding may make a motion longer."""
 _PARALLEL = 1e-10
 """Sine of the angle to a wall below which a motion is along it: rounding, for walls up to 10 km from the origin."""
 
@@ -226,14 +224,16 @@ def bounded(segments, x, y, dx, dy, vx, vy, left, radius):  # type: ignore[no-un
     """How far a disc may follow what an engine leaves of its motion, until it touches another wall.
 
     (dx, dy) is the whole motion that is wanted, (vx, vy) what the engine leaves of it where the disc stands, left the
-    share of it that is still to be made. An answer that leads into a wall that the disc touches, or is longer than what
-    is wanted, or no number, gives way to the nearest motion that does not. Round the end of a wall it is a short piece.
+    share of it that is still to be made. An answer that leads into a wall that the disc touches, goes farther in its
+    direction than is wanted, or is no number gives way to the nearest motion that leads into none. Round the end of a
+    wall it is a short piece.
     Returns (mx, my, share): the motion, and which share it is; (0, 0, left) where walls hold the disc.
     """
     touched = _touching(segments, x, y, radius)
     wanted = math.hypot(dx, dy)
     depth = _PARALLEL * wanted
-    if not (math.hypot(vx, vy) <= wanted * (1.0 + _LONGER) and _into_none(touched, vx, vy, depth)):
+    given = vx * (dx - vx) + vy * (dy - vy)  # by walls that push; those that only hold give nothing
+    if not (given >= -depth * wanted and _into_none(touched, vx, vy, depth)):
         vx, vy = _allowed(touched, dx, dy)
     if math.hypot(vx, vy) <= depth:
         return 0.0, 0.0, left

@@ -178,8 +178,11 @@ class World:
             done += count
             if contact:
                 engine = engine or Engine(robot, self._walls)
-                parts.append(engine.step(state[: follower.LEG], step))
-                follower.feel(state, *parts[-1][-1], robot.max_acceleration, step, robot.radius)
+                before = float(state[follower.HEADING])
+                part = np.array([(*point, before) for point in engine.step(state, step)])
+                follower.feel(state, part[-1, 0], part[-1, 1], robot.max_acceleration, step, robot.radius)
+                part[-1, 2] = state[follower.HEADING]
+                parts.append(part)
                 done += 1
         trajectory = np.concatenate(parts)
         trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
