@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.sim.robot import BENDS, SKIN, nearest_wall, slide
+from polyexplore_gym.sim.robot import SKIN, is_free, nearest_wall
 
 X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, MET = range(9)
 """The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
@@ -218,66 +218,54 @@ def forget(state, progress):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _push(state, acceleration, step, walls, radius, bends):  # type: ignore[no-untyped-def]
-    """One step among walls in reach: they take what of the motion leads into them. Returns the number of bends."""
-    x, y = state[X], state[Y]
+def feel(state, x, y, acceleration, step, radius):  # type: ignore[no-untyped-def]
+    """Take over where a step among walls ended, and what they took of the motion commanded.
+
+    acceleration m/s2 is what the wheels go on with where a wall holds them.
+    """
     c, s = math.cos(state[HEADING]), math.sin(state[HEADING])
     moved = state[SPEED] * step
-    n = slide(walls, x, y, state[SPEED] * c * step, state[SPEED] * s * step, radius, bends)
-    state[X], state[Y] = bends[n - 1]
-    progress = (state[X] - x) * c + (state[Y] - y) * s
+    progress = (x - state[X]) * c + (y - state[Y]) * s
     lost = moved - progress
     if lost > _ROUNDING * moved:
         state[DEFICIT] += lost
         state[MET] = 1.0
         state[SPEED] = max(progress / step, min(state[SPEED], acceleration * max(_STALL - step, 0.0)))
     forget(state, progress)
-    return n
+    state[X], state[Y], state[HEADING] = x, y, _wrap(state[HEADING] + state[RATE] * step)
+    if state[DEFICIT] > _BUMP * radius:
+        state[PHASE] = BUMP
 
 
 @njit(cache=True)
 def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, walls, box, trajectory):  # type: ignore[no-untyped-def]
-    """Follow the path for at most so many steps.
+    """Follow the path for at most so many steps, as long as no wall takes anything of the motion.
 
-    body: radius and track (m). walls (W, 4): all those that meet the box (x, y min, x, y max). Fills trajectory
-    (n, 3), n > `BENDS`: the pose after every step, and on the way where walls bend it. Returns (rows filled, steps
-    done); it ends early when the phase is `DONE` or later, when the trajectory is full, and before a step that might
-    leave the box.
+    That is what a physics engine without contacts integrates. body: radius and track (m). walls (W, 4): all those that
+    meet the box (x, y min, x, y max). Fills trajectory (n, 3) with the pose after every step. Returns (steps done,
+    contact). With contact True the command for the next step is set but not executed: a wall takes some of it. Else it
+    ends when the phase is `DONE` or later, when the trajectory is full, and before a step that might leave the box.
     """
     radius = body[0]
-    bends = np.empty((BENDS, 2))
     clear = 0.0  # at least so far to the nearest wall
-    row = 0
-    for done in range(steps):
-        if row + BENDS > trajectory.shape[0]:
-            return row, done
+    for done in range(min(steps, trajectory.shape[0])):
         x, y = state[X], state[Y]
         far = (1.0 + SKIN) * radius + min(state[SPEED] + limits[2] * step, limits[0]) * step
         if x - far < box[0] or y - far < box[1] or x + far > box[2] or y + far > box[3]:
-            return row, done
+            return done, False
         command(state, path, speeds, heading, final_turn, limits, body, step)
         if state[PHASE] >= DONE:
-            return row, done
+            return done, False
         # position first, then angle, each from the velocities at the start of the step, as Chipmunk does
         moved = state[SPEED] * step
+        dx, dy = state[SPEED] * math.cos(state[HEADING]) * step, state[SPEED] * math.sin(state[HEADING]) * step
         if moved > clear:
             clear = nearest_wall(walls, x, y)[0] - (1.0 + 2.0 * SKIN) * radius
-        n = 1
-        if moved <= clear:
-            state[X] = x + state[SPEED] * math.cos(state[HEADING]) * step
-            state[Y] = y + state[SPEED] * math.sin(state[HEADING]) * step
-            bends[0, 0], bends[0, 1] = state[X], state[Y]
-            forget(state, moved)
-            clear -= moved
-        else:
-            n = _push(state, limits[2], step, walls, radius, bends)
-            clear = 0.0
-        for k in range(n):
-            trajectory[row, 0], trajectory[row, 1], trajectory[row, 2] = bends[k, 0], bends[k, 1], state[HEADING]
-            row += 1
+            if moved > clear and not is_free(walls, x, y, dx, dy, radius):
+                return done, True
+        clear -= moved
+        state[X], state[Y] = x + dx, y + dy
         state[HEADING] = _wrap(state[HEADING] + state[RATE] * step)
-        trajectory[row - 1, 2] = state[HEADING]
-        if state[DEFICIT] > _BUMP * radius:
-            state[PHASE] = BUMP
-            return row, done + 1
-    return row, steps
+        forget(state, moved)
+        trajectory[done, 0], trajectory[done, 1], trajectory[done, 2] = state[X], state[Y], state[HEADING]
+    return min(steps, trajectory.shape[0]), False

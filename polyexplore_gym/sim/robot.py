@@ -21,8 +21,6 @@ SKIN = 1e-7
 far it touches."""
 _ARC = 0.05
 """Round the end of a wall a disc slides in pieces of this length, in radii; it strays outwards by half its square."""
-BENDS = 256
-"""Pieces into which one motion of a sliding disc is broken at most; what is left then is lost to the walls."""
 _PARALLEL = 1e-10
 """Sine of the angle to a wall below which a motion is along it: rounding, for walls up to 10 km from the origin."""
 
@@ -166,20 +164,20 @@ def _into_none(touched, dx, dy, depth):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _allowed(touched, dx, dy):  # type: ignore[no-untyped-def]
-    """What the walls touched leave of a motion without friction: (dx, dy, row of the wall slid along or -1).
+    """What the walls touched leave of a motion without friction: the nearest that leads into none of them.
 
-    The nearest motion that leads into none of them: the whole, that along one of them, or none.
+    That is the whole, that along one of them, or none.
     """
     depth = _PARALLEL * math.hypot(dx, dy)
     if _into_none(touched, dx, dy, depth):
-        return dx, dy, -1
+        return dx, dy
     for i in range(touched.shape[0]):
         nx, ny = touched[i, 1], touched[i, 2]
         into = dx * nx + dy * ny
         vx, vy = dx - into * nx, dy - into * ny
         if into < 0.0 and _into_none(touched, vx, vy, depth):
-            return vx, vy, i
-    return 0.0, 0.0, -1
+            return vx, vy
+    return 0.0, 0.0
 
 
 @njit(cache=True)
@@ -195,42 +193,60 @@ def _straight(segments, touched, row, vx, vy, radius):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def slide(segments, x, y, dx, dy, radius, bends):  # type: ignore[no-untyped-def]
-    """Move a disc by (dx, dy); walls take what leads into them, without friction.
-
-    Swept from contact to contact, so that no motion is too long. bends (`BENDS`, 2) takes the points at which its way
-    bends, the last being its end; returns how many they are, at least 1.
-    """
-    left, n = 1.0, 0
+def _sweep(segments, touched, x, y, dx, dy, radius):  # type: ignore[no-untyped-def]
+    """How much (share) of a motion that leads into no wall touched a disc makes before it touches another: 1 if all."""
     reach = radius * (1.0 + SKIN)
-    while n < BENDS:
-        touched = _touching(segments, x, y, radius)
-        vx, vy, row = _allowed(touched, dx, dy)
-        if vx == 0.0 and vy == 0.0:
-            break
-        share = left if row < 0 else min(left, _straight(segments, touched, row, vx, vy, radius))
-        mx, my = vx * share, vy * share
-        x_min, x_max = x + min(0.0, mx) - reach, x + max(0.0, mx) + reach
-        y_min, y_max = y + min(0.0, my) - reach, y + max(0.0, my) + reach
-        free, i = 1.0, 0
-        for k in range(segments.shape[0]):
-            if i < touched.shape[0] and touched[i, 0] == k:  # not moved closer to
-                i += 1
-                continue
-            x1, y1, x2, y2 = segments[k]
-            if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
-                continue
-            free = min(free, _enters(x1 - x, y1 - y, x2 - x, y2 - y, mx, my, reach))
-        x, y = x + mx * free, y + my * free
-        bends[n, 0], bends[n, 1] = x, y
-        n += 1
-        left -= share * free
-        if left <= 0.0:
-            break
-    if n == 0:
-        bends[0, 0], bends[0, 1] = x, y
-        n = 1
-    return n
+    x_min, x_max = x + min(0.0, dx) - reach, x + max(0.0, dx) + reach
+    y_min, y_max = y + min(0.0, dy) - reach, y + max(0.0, dy) + reach
+    free, i = 1.0, 0
+    for k in range(segments.shape[0]):
+        if i < touched.shape[0] and touched[i, 0] == k:  # not moved closer to
+            i += 1
+            continue
+        x1, y1, x2, y2 = segments[k]
+        if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
+            continue
+        free = min(free, _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
+    return free
+
+
+@njit(cache=True)
+def is_free(segments, x, y, dx, dy, radius):  # type: ignore[no-untyped-def]
+    """Whether no wall takes anything of a disc's motion (dx, dy); along a wall, or away from it, it is free."""
+    touched = _touching(segments, x, y, radius)
+    if not _into_none(touched, dx, dy, _PARALLEL * math.hypot(dx, dy)):
+        return False
+    return _sweep(segments, touched, x, y, dx, dy, radius) == 1.0
+
+
+@njit(cache=True)
+def bounded(segments, x, y, dx, dy, vx, vy, left, radius):  # type: ignore[no-untyped-def]
+    """How far a disc may follow what an engine leaves of its motion, until it touches another wall.
+
+    (dx, dy) is the whole motion that is wanted, (vx, vy) what the engine leaves of it where the disc stands, left the
+    share of it that is still to be made. An answer that leads into a wall that the disc touches, goes farther in its
+    direction than is wanted, or is no number gives way to the nearest motion that leads into none. Round the end of a
+    wall it is a short piece.
+    Returns (mx, my, share): the motion, and which share it is; (0, 0, left) where walls hold the disc.
+    """
+    touched = _touching(segments, x, y, radius)
+    wanted = math.hypot(dx, dy)
+    depth = _PARALLEL * wanted
+    given = vx * (dx - vx) + vy * (dy - vy)  # by walls that push; those that only hold give nothing
+    if not (given >= -depth * wanted and _into_none(touched, vx, vy, depth)):
+        vx, vy = _allowed(touched, dx, dy)
+    if math.hypot(vx, vy) <= depth:
+        return 0.0, 0.0, left
+    row, held = -1, np.inf  # the wall it slides along
+    for i in range(touched.shape[0]):
+        nx, ny = touched[i, 1], touched[i, 2]
+        leaves = vx * nx + vy * ny
+        if dx * nx + dy * ny < -depth and leaves < held:
+            row, held = i, leaves
+    share = left if row < 0 else min(left, _straight(segments, touched, row, vx, vy, radius))
+    mx, my = vx * share, vy * share
+    free = _sweep(segments, touched, x, y, mx, my, radius)
+    return mx * free, my * free, share * free
 
 
 @njit(cache=True)

@@ -10,6 +10,7 @@ import numpy as np
 from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
 from polyexplore_gym.errors import InvalidMotionError
 from polyexplore_gym.sim import follower
+from polyexplore_gym.sim.engine import Engine
 from polyexplore_gym.sim.laser import Laser
 from polyexplore_gym.sim.pose import wrap
 from polyexplore_gym.sim.robot import glide, nearest_wall, walls_near, way_length
@@ -51,10 +52,11 @@ class DriveResult:
 class World:
     """Owner of the true state. Walls are static; the robot is a disc on two driven wheels.
 
-    In `physics` mode a follower commands the wheels within their limits at a fixed time step, and walls take what of
-    the motion leads into them, without friction. The motion of a step is swept from contact to contact, so neither
-    speed nor step lets the disc into a wall. A wall that takes more than 8 % of the radius (2 cm at 0.25 m) of the
-    commanded motion is a bump and ends the drive; grazing along a wall does not.
+    In `physics` mode a follower commands the wheels within their limits at a fixed time step. Where no wall is in the
+    way a physics engine only integrates velocities, so the follower's kernel does that itself (the same sum, to
+    rounding); as soon as a step would touch a wall pymunk takes over and resolves the contact, see `sim.engine`. Each
+    of its steps is swept, so neither speed nor time step lets the disc into a wall. A wall that takes more than 8 % of
+    the radius (2 cm at 0.25 m) of the commanded motion is a bump and ends the drive; grazing along a wall does not.
 
     In `kinematic` mode the robot follows the path exactly, turns on the spot at its vertices and halts 0.4 % of the
     radius before the first wall that its disc would touch.
@@ -163,26 +165,25 @@ class World:
         state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
         speeds = follower.vertex_speeds(path, self._limits, robot.radius, step)
         steps = max(1, math.ceil(self.config.time_limit / step))
-        parts, done = [self._pose[None]], 0
+        body, rows = (robot.radius, robot.track), np.empty((_ROWS, 3))
+        engine: Engine | None = None  # no longer than the drive, so that none depends on the contacts of an earlier one
+        parts, done, contact = [self._pose[None]], 0, False
         while done < steps and state[follower.PHASE] < follower.DONE:
-            box, walls = self._around(path, state)
-            rows = np.empty((_ROWS, 3))
-            filled, count = follower.follow(
-                state,
-                path,
-                speeds,
-                heading,
-                final_turn,
-                self._limits,
-                (robot.radius, robot.track),
-                step,
-                steps - done,
-                walls,
-                box,
-                rows,
+            if not contact:
+                box, walls = self._around(path, state)
+            count, contact = follower.follow(
+                state, path, speeds, heading, final_turn, self._limits, body, step, steps - done, walls, box, rows
             )
-            parts.append(rows[:filled])
+            parts.append(rows[:count].copy())
             done += count
+            if contact:
+                engine = engine or Engine(robot, self._walls)
+                before = float(state[follower.HEADING])
+                part = np.array([(*point, before) for point in engine.step(state, step)])
+                follower.feel(state, part[-1, 0], part[-1, 1], robot.max_acceleration, step, robot.radius)
+                part[-1, 2] = state[follower.HEADING]
+                parts.append(part)
+                done += 1
         trajectory = np.concatenate(parts)
         trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
         self._pose = trajectory[-1].copy()

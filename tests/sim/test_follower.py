@@ -108,7 +108,7 @@ def test_ends_before_it_leaves_the_box_of_known_walls() -> None:
     state, rows, done = np.zeros(9), [], 0
     for edge in (3.0, 6.0, 12.0):
         part = np.empty((2048, 3))
-        filled, count = follower.follow(
+        count, contact = follower.follow(
             state,
             path,
             follower.vertex_speeds(path, limits, robot.radius, step),
@@ -122,9 +122,10 @@ def test_ends_before_it_leaves_the_box_of_known_walls() -> None:
             (-3.0, -3.0, edge, 3.0),
             part,
         )
-        assert part[:filled, 0].max() + robot.radius < edge
+        assert not contact
+        assert part[:count, 0].max() + robot.radius < edge
         assert (state[follower.PHASE] == follower.DONE) == (edge == 12.0)
-        rows.append(part[:filled])
+        rows.append(part[:count])
         done += count
     whole = World(walls, robot, SensorConfig(), DriveConfig(), np.zeros(3)).drive(path, 1.0)
     np.testing.assert_allclose(np.concatenate(rows)[:, :2], whole.trajectory[1:, :2])

@@ -1,19 +1,18 @@
 import math
 
 import numpy as np
-import pymunk
 import pytest
 import shapely
-from sim_scenes import boxed, clear_point, lines_of, random_walls
+from sim_scenes import clear_point, lines_of, random_walls
 
 from polyexplore_gym.sim.robot import (
-    BENDS,
     STANDOFF,
+    bounded,
     first_contact,
+    is_free,
     nearest_wall,
     profile_distance,
     profile_time,
-    slide,
     walls_near,
     way_length,
 )
@@ -84,76 +83,30 @@ def test_a_disc_held_off_a_wall_is_held_again() -> None:
     assert held > 100
 
 
-def slid(walls: np.ndarray, start: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray:
-    bends = np.empty((BENDS, 2))
-    return np.vstack([start, bends[: slide(walls, *start, *way, radius, bends)]])
+def test_a_motion_is_free_where_shapely_finds_room() -> None:
+    rng, radius, counts = np.random.default_rng(4), 0.25, [0, 0]
+    for _ in range(800):
+        walls = random_walls(rng, int(rng.integers(1, 12)), side=8.0)
+        start, way = clear_point(rng, walls, 5.0, radius * (1 + 1e-6)), rng.uniform(-3, 3, 2)
+        gap = shapely.distance(lines_of(walls), shapely.linestrings([start, start + way])) - radius
+        free = is_free(walls, *start, *way, radius)
+        assert free == (gap > 1e-7 * radius) or abs(gap) < 1e-6 * radius
+        counts[free] += 1
+    assert min(counts) > 100
+    wall, at = np.array([[-1.0, 0.0, 1.0, 0.0]]), radius * (1 + 1.5e-7)  # touching
+    assert is_free(wall, 0.0, at, 3.0, 0.0, radius)
+    assert is_free(wall, 0.0, at, 3.0, 0.1, radius)
+    assert not is_free(wall, 0.0, at, 3.0, -1e-6, radius)
 
 
-def test_slides_as_pymunk_in_small_steps() -> None:
-    """pymunk without friction, its velocity set anew in every small step, is the slow twin."""
-    rng, radius, off, along = np.random.default_rng(4), 0.25, [], 0
-    for _ in range(150):
-        walls = boxed(random_walls(rng, 12, side=6.0), 3.0)
-        start, way = clear_point(rng, walls, 2.5, radius), rng.uniform(-2, 2, 2)
-        space = pymunk.Space()
-        space.collision_slop, space.collision_bias = 1e-6, 0.0
-        body = pymunk.Body(1.0, 1.0)
-        body.position = tuple(start)
-        shape = pymunk.Circle(body, radius)
-        shape.friction = 0.0
-        static = space.static_body
-        space.add(body, shape, *(pymunk.Segment(static, w[:2], w[2:], 0.0) for w in walls.tolist()))
-        for _ in range(2000):
-            body.velocity = tuple(way)
-            space.step(1 / 2000)
-        got = slid(walls, start, way, radius)
-        along += len(got) > 2
-        off.append(math.dist(got[-1], body.position))
-    assert along > 60
-    assert np.median(off) < 0.002
-    # on a wall's end that it meets head-on, rounding decides the side
-    assert np.mean(np.array(off) < 0.01) > 0.97
-
-
-@pytest.mark.parametrize("longest", [0.1, 3.0, 300.0, 30_000.0])
-def test_slides_from_contact_to_contact_and_never_into_a_wall(longest: float) -> None:
-    rng, bent, free = np.random.default_rng(5), 0, 0
-    for _ in range(300):
-        radius = 10.0 ** rng.uniform(-1.7, 0.3)
-        walls, shift = boxed(random_walls(rng, 25, side=30.0), 16.0), rng.uniform(-100, 100, 2)
-        start = radius * clear_point(rng, walls, 15.0, 1.0) + shift
-        walls = radius * walls + np.tile(shift, 2)
-        lines = lines_of(walls)
-        for _ in range(4):  # on from where it was held
-            angle = rng.uniform(-math.pi, math.pi)
-            way = longest * radius * rng.uniform() * np.array([math.cos(angle), math.sin(angle)])
-            got = slid(walls, start, way, radius)
-            assert shapely.distance(lines, shapely.linestrings(got)) > radius * (1 - 1e-9)
-            assert np.hypot(*np.diff(got, axis=0).T).sum() <= math.hypot(*way) * (1 + 1e-9)
-            assert (np.diff(got, axis=0) @ way >= 0.0).all()
-            if shapely.distance(lines, shapely.linestrings([start, start + way])) > radius * (1 + 1e-6):
-                np.testing.assert_array_equal(got, [start, start + way])
-                free += 1
-            bent += len(got) > 2
-            start = got[-1]
-    assert bent > (5 if longest < 1.0 else 200)
-    assert free > 500 or longest > 1.0
-
-
-def test_a_wall_takes_what_leads_into_it_and_no_more() -> None:
-    floor, side = np.array([[-5.0, 0.0, 1.0, 0.0]]), np.array([[0.9, 0.0, 0.9, 3.0]])
-    got = slid(floor, np.array([0.0, 0.3]), np.array([0.5, -0.5]), 0.25)
-    np.testing.assert_allclose(got[1:], [[0.05, 0.25], [0.5, 0.25]], atol=1e-7)
-    got = slid(np.vstack([floor, side]), np.array([0.0, 0.25]), np.array([4.0, -0.5]), 0.25)
-    np.testing.assert_allclose(got[-1], [0.65, 0.25], atol=1e-7)  # in the corner both hold it
-    np.testing.assert_array_equal(slid(floor, np.array([0.0, 0.25]), np.array([0.0, -1.0]), 0.25)[-1], [0.0, 0.25])
-    # round the end of the floor: on a circle about it, and then down
-    got = slid(floor, np.array([0.9, 0.25]), np.array([1.0, -2.0]), 0.25)
-    gaps = np.hypot(*(got - [1.0, 0.0]).T)
-    assert gaps[1:-1].min() > 0.25
-    assert gaps[1:-1].max() < 0.2505
-    assert got[-1, 0] - got[-2, 0] == pytest.approx((got[-2, 1] - got[-1, 1]) / 2)
-    np.testing.assert_array_equal(slid(np.empty((0, 4)), np.zeros(2), np.array([3.0, 4.0]), 0.25)[1:], [[3.0, 4.0]])
+@pytest.mark.parametrize("answer", [(3.0, -0.5), (3.0, 0.6), (math.nan, 0.0), (math.inf, 0.0), (-1.0, 0.0)])
+def test_what_leads_into_a_wall_or_too_far_is_not_followed(answer: tuple[float, float]) -> None:
+    wall, radius = np.array([[-9.0, 0.0, 9.0, 0.0], [5.0, 0.0, 5.0, 3.0]]), 0.25
+    at = radius * (1 + 1e-7)
+    assert bounded(wall, 0.0, at, 3.0, -0.5, *answer, 1.0, radius) == pytest.approx((3.0, 0.0, 1.0))
+    assert bounded(wall, 0.0, at, 3.0, -0.5, 1.0, 0.0, 0.5, radius) == pytest.approx((0.5, 0.0, 0.5))  # it may be less
+    assert bounded(wall, 0.0, at, 9.0, -0.5, 9.0, 0.0, 1.0, radius) == pytest.approx((4.75, 0.0, 4.75 / 9))
+    assert bounded(wall, 4.75, at, 3.0, -0.5, *answer, 0.7, radius) == (0.0, 0.0, 0.7)  # held in the corner
 
 
 @pytest.mark.parametrize(("distance", "speed", "acceleration"), [(4.0, 1.2, 0.6), (0.5, 1.2, 0.6), (2.4, 1.2, 0.6)])
