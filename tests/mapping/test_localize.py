@@ -99,7 +99,7 @@ def test_update_equals_the_dense_filter():
                 lines.rho[i] - rho + expected[0] * c + expected[1] * s,
             ]
         )
-        r = lines.covariance[i] + np.diag(np.square(module.BIAS))
+        r = lines.covariance[i] + np.diag(np.square((module.BIAS[0], 0.5 * module.BIAS[1])))
         gain = np.zeros((3 + n, 2))
         gain[:3] = joint[:3] @ h.T @ np.linalg.inv(h @ joint @ h.T + r)
         expected += gain[:3] @ innovation
