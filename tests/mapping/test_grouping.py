@@ -48,7 +48,7 @@ def test_each_line_takes_the_free_returns_within_a_pixel(seed):
             expected[on] = count
             count += 1
     label = np.full(800, -1)
-    assert take_each(x, y, ends, label, 6) == count > 3
+    assert take_each(x, y, ends, label, 6, RASTER) == count > 3
     np.testing.assert_array_equal(label, expected)
 
 
