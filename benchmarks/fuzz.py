@@ -1,6 +1,7 @@
 """Where does the environment crash, hang or end too early? Random configurations and plans, each from one integer.
 
-    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--largest 10000] [--out results/fuzz]
+    python benchmarks/fuzz.py [--first 0] [--count 200] [--seconds 600] [--largest 10000] [--pose exact]
+                              [--out results/fuzz]
     python benchmarks/fuzz.py --case 17 [--picture x.png]
     python benchmarks/fuzz.py --scaled [--first 0] [--count 50]
 
@@ -312,7 +313,7 @@ def case_of(number: int) -> Case:
     size = scale if with_robot else 1.0
     values: dict[str, Any] = {
         "sensor": {
-            "beams": int(np.exp(rng.uniform(math.log(20.0), math.log(2000.0)))),
+            "beams": max(int(np.exp(rng.uniform(math.log(20.0), math.log(2000.0)))), math.ceil(view / 15.0) + 1),
             "field_of_view": math.radians(view),
             "max_range": reach,
             "sigma_range": 0.01 * noise * min(scale, 1.0 if not with_robot else scale),
@@ -597,6 +598,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, nargs="+", help="these instead, also those played already")
     parser.add_argument("--seconds", type=float, default=math.inf, help="stop after so many")
     parser.add_argument("--largest", type=float, default=math.inf, help="leave out plans of more squares of the radius")
+    parser.add_argument("--pose", help="only cases of this pose mode")
     parser.add_argument("--case", type=int, help="play this one here and print all about it")
     parser.add_argument("--picture", type=Path, help="of --case")
     parser.add_argument("--scaled", action="store_true", help="the same exploration in another size")
@@ -630,7 +632,8 @@ def _study(options: argparse.Namespace) -> None:
         for number in todo:
             if time.monotonic() - began > options.seconds:
                 break
-            if options.largest < math.inf and case_of(number).size > options.largest:
+            case = case_of(number)
+            if case.size > options.largest or options.pose not in (None, case.values["pose"]["mode"]):
                 continue
             result = known[number] = child.play(number)
             out.write(json.dumps(result) + "\n")
