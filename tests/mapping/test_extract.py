@@ -9,6 +9,8 @@ from line_scenes import HALF, box, cast, distance, ends_on, jagged_room, measure
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import extract_lines
 
+pytestmark = pytest.mark.bounds
+
 SENSOR = SensorConfig()
 FIVE = SensorConfig(sigma_range=0.05, sigma_angle=math.radians(0.5))
 FULL = np.linspace(-math.pi, math.pi, 720, endpoint=False)

@@ -11,6 +11,8 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import LineMap, extract_lines
 from polyexplore_gym.mapping.hough import RASTER, take_each
 
+pytestmark = pytest.mark.bounds
+
 SENSOR = SensorConfig(sigma_range=0.02, sigma_angle=math.radians(0.2))
 ROOM = box(-1, -2, 3, 2.5)
 APART = MappingConfig(start="hough", grouping=False)
