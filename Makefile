@@ -1,10 +1,11 @@
-# All the set-up on a machine that has only Python, make and git: `make bench` and `make test`.
+# All the set-up on a machine that has only Python, make and git: `make bench` and `make test`;
+# `make bounds` runs some of the tests once more with every array access in the kernels checked.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
 
-.PHONY: bench test clean
+.PHONY: bench test bounds clean
 
 bench: .stamps/core
 	$(BIN)/polyexplore bench --out results/bench
@@ -14,6 +15,10 @@ test: .stamps/dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/pytest -n 2
+
+# Compiled apart: kernels with checks must not take the place of those without.
+bounds: .stamps/dev
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/.bounds-cache $(BIN)/pytest -n 2 --dist loadfile -m 'bounds and not slow'
 
 .stamps/venv:
 	$(PYTHON) -m venv $(VENV)
@@ -30,4 +35,4 @@ test: .stamps/dev
 	touch $@
 
 clean:
-	rm -rf $(VENV) .stamps results
+	rm -rf $(VENV) .stamps .bounds-cache results

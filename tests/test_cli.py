@@ -365,7 +365,9 @@ def test_without_matplotlib_there_are_maps(tmp_path, capsys, monkeypatch):
     log = str(carmen(tmp_path / "room.log"))
     assert main(["linemap", log, "--out", str(tmp_path / "maps")]) == 0
     assert "no room.png: this needs matplotlib" in capsys.readouterr().err
-    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == ["room.geojson", "room.json"]
+    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == [
+        "room.geojson", "room.json", "room.pgm", "room.yaml",
+    ]  # fmt: skip
     assert main(["linemap", log, "--out", str(tmp_path / "a.png")]) == 2
     assert "polyexplore-gym[plots]" in capsys.readouterr().err
 

@@ -10,6 +10,8 @@ import pytest
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.floorplan import FloorPlan, generate
 
+pytestmark = pytest.mark.bounds
+
 PLACEMENTS = ("midpoint", "in_front")
 
 

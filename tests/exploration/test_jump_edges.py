@@ -14,6 +14,8 @@ from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration import jump_edges as je
 from polyexplore_gym.exploration import scan_polygon as sp
 
+pytestmark = pytest.mark.bounds
+
 NO_WALLS = np.zeros((0, 4))
 EXACT = tol_of(SensorConfig(sigma_range=0.0, sigma_angle=0.0), max_range=8.0)
 """A map without noise, so that what is asked for is what counts."""

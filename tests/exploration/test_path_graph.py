@@ -27,6 +27,8 @@ from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL
 from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.exploration.tolerances import squeezed
 
+pytestmark = pytest.mark.bounds
+
 RADIUS = 0.25
 TOL = tol_of(SensorConfig(max_range=8.0), RADIUS)
 ALL = np.array([-1e3, -1e3, 1e3, 1e3])

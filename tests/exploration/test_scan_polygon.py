@@ -14,6 +14,8 @@ from polyexplore_gym.exploration import scan_polygon as sp
 from polyexplore_gym.exploration.tolerances import noise_at
 from polyexplore_gym.sim.laser import cast_rays
 
+pytestmark = pytest.mark.bounds
+
 FIELDS = (0.5, 1.5, math.pi, 4.2, 6.0, 2 * math.pi)
 SENSOR = SensorConfig()
 TOL = tol_of(SENSOR)

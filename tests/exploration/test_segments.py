@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import shapely
@@ -9,6 +11,8 @@ from exploration_scenes import lines_of
 from numba import njit
 
 from polyexplore_gym.exploration import segments as sg
+
+pytestmark = pytest.mark.bounds
 
 
 def random_segments(rng, n, half=12.0):
@@ -104,3 +108,9 @@ def test_crossing_free_with_owners_and_slack(seed):
             assert sg.crossing_free(*w, grid, a, b, slack_a, slack_b) != blocked
             outcomes.append(blocked)
     assert 0.03 < np.mean(outcomes) < 0.95
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_BOUNDSCHECK") != "1", reason="make bounds checks them")
+def test_array_bounds_are_checked():
+    with pytest.raises(IndexError):
+        _point_distances(np.zeros((2, 2)), np.zeros((1, 4)))

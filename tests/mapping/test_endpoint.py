@@ -11,6 +11,8 @@ from polyexplore_gym.mapping import extract_lines
 from polyexplore_gym.mapping.endpoint import border, divide, misfit
 from polyexplore_gym.mapping.fit import fit, normal_variance
 
+pytestmark = pytest.mark.bounds
+
 TWO = SensorConfig(sigma_range=0.02, sigma_angle=math.radians(0.2))
 
 

@@ -9,6 +9,8 @@ from line_scenes import HALF, box, cast, distance, ends_on, jagged_room, measure
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import extract_lines
 
+pytestmark = pytest.mark.bounds
+
 SENSOR = SensorConfig()
 FIVE = SensorConfig(sigma_range=0.05, sigma_angle=math.radians(0.5))
 FULL = np.linspace(-math.pi, math.pi, 720, endpoint=False)
@@ -279,10 +281,10 @@ def test_what_lies_between_far_beams_of_a_wall_is_no_wall():
     angles = np.linspace(-math.pi / 2, math.pi / 2, 181)
     lines = extract_lines(angles, 4.0 / np.maximum(np.cos(angles), 1e-9), sensor, config)
     assert len(lines.segments) == 1
-    assert len(lines.fragments) == 24
+    assert len(lines.fragments) == 28  # all returns a door's width apart, 14 on each side
     np.testing.assert_allclose(lines.fragments[:, [0, 2]], 4.0, atol=1e-6)
-    assert (lines.fragments[:, 3] - lines.fragments[:, 1] > 0.1).all()  # the free space on the left
-    assert np.abs(lines.fragments[:, 3] - lines.fragments[:, 1]).max() < 1.3
+    # The free space on the left; a fifth of a door's width long: what lies between far beams is not known.
+    np.testing.assert_allclose(lines.fragments[:, 3] - lines.fragments[:, 1], 0.1, rtol=0.01)
     # a pole beside the wall is still a piece across its beam
     ranges = 4.0 / np.maximum(np.cos(angles), 1e-9)
     ranges[160] = 2.0

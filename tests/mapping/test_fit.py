@@ -11,6 +11,8 @@ from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.mapping import extract_lines
 from polyexplore_gym.mapping.fit import distance2, fit, fuse, normal_variance, shift, to_map, wrap
 
+pytestmark = pytest.mark.bounds
+
 WALLS = {
     "frontal": ([3.0, -2.0, 3.0, 2.0], False),
     "side": ([1.0, 1.5, 6.0, 1.5], False),

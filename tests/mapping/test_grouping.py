@@ -11,6 +11,8 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import LineMap, extract_lines
 from polyexplore_gym.mapping.hough import RASTER, take_each
 
+pytestmark = pytest.mark.bounds
+
 SENSOR = SensorConfig(sigma_range=0.02, sigma_angle=math.radians(0.2))
 ROOM = box(-1, -2, 3, 2.5)
 APART = MappingConfig(start="hough", grouping=False)
@@ -48,7 +50,7 @@ def test_each_line_takes_the_free_returns_within_a_pixel(seed):
             expected[on] = count
             count += 1
     label = np.full(800, -1)
-    assert take_each(x, y, ends, label, 6) == count > 3
+    assert take_each(x, y, ends, label, 6, RASTER) == count > 3
     np.testing.assert_array_equal(label, expected)
 
 

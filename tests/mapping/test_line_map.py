@@ -15,6 +15,8 @@ from polyexplore_gym.mapping.grid import empty_grid, grid_put, grid_query, grid_
 from polyexplore_gym.mapping.merge import candidates
 from polyexplore_gym.mapping.slots import oriented
 
+pytestmark = pytest.mark.bounds
+
 SENSOR = SensorConfig()
 FIVE = SensorConfig(sigma_range=0.05, sigma_angle=math.radians(0.5))
 POSE_SIGMA = np.array([0.02, 0.02, math.radians(0.5)])

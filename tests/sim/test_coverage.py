@@ -12,6 +12,8 @@ from polyexplore_gym.errors import InvalidMotionError
 from polyexplore_gym.floorplan import FloorPlan
 from polyexplore_gym.sim.coverage import MOST_POINTS, Coverage, grid_points, grid_spacing, side
 
+pytestmark = pytest.mark.bounds
+
 
 def exactly_seen(walls: np.ndarray, points: np.ndarray, pose: np.ndarray, sensor: SensorConfig) -> np.ndarray:
     """Within range and field of view, and the sight line meets no wall: by shapely."""

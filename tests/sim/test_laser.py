@@ -9,6 +9,8 @@ from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.errors import InvalidMotionError
 from polyexplore_gym.sim.laser import MIN_RANGE, Laser, cast_rays
 
+pytestmark = pytest.mark.bounds
+
 
 def exact_ranges(walls: np.ndarray, x: float, y: float, angles: np.ndarray, max_range: float) -> np.ndarray:
     """Nearest intersection of each ray with the walls, by shapely."""

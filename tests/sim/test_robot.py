@@ -17,6 +17,8 @@ from polyexplore_gym.sim.robot import (
     way_length,
 )
 
+pytestmark = pytest.mark.bounds
+
 
 def test_nearest_wall_agrees_with_shapely() -> None:
     rng = np.random.default_rng(0)
