@@ -134,9 +134,10 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._trajectory = [self._world.pose[None]]
         self._measured_at: list[np.ndarray] = []
         self._felt: float | None = None
-        self._look_around()
         self._path = self._pose_model.estimate[None, :2]
-        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
+        self._look_around(c.exploration.look_around)
+        if not c.exploration.look_around and not self._exploration.reachable.any():
+            self._look_around(True)  # close to a wall there may be nothing else to do
         self._observe()
         info = self._info(StepOutcome(), invalid=False, truncated=False)
         if self.render_mode == "human":
@@ -223,16 +224,17 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
 
     # What happens in a step -------------------------------------------------------------------
 
-    def _look_around(self) -> None:
-        """Measure at the start; all round, by turning on the spot, if so configured."""
+    def _look_around(self, all_round: bool) -> None:
+        """Measure at the start, all round by turning on the spot or not, and plan."""
         assert self._world is not None
         fov = self.config.sensor.field_of_view
-        turns = math.ceil(2.0 * math.pi / fov - 1e-9) if self.config.exploration.look_around else 1
+        turns = math.ceil(2.0 * math.pi / fov - 1e-9) if all_round else 1
         heading = self._world.pose[2]
         for i in range(turns):
             if i:
                 self._drive(self._world.pose[None, :2], heading + i * 2.0 * math.pi / turns)
             self._measure(self._world.pose, None, arrived=True)
+        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
 
     def _go(self, row: int) -> None:
         """Drive to a node, measure there (and on the way, if so configured), and plan anew."""

@@ -22,6 +22,9 @@ from polyexplore_gym.scan import Scan
 
 VISIT = 4
 """A measurement made for a jump edge in vain counts so much: an attempt that ended before its node counts one."""
+_MOST_TRIED, _ENOUGH = 64, 8
+"""For so many jump edges without a node another place is looked for at most, and so many are enough where there is no
+other: they are as many as an observation holds."""
 _AHEAD = 0.5
 """A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
 
@@ -425,10 +428,10 @@ class ExplorationMap:
             g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step), self.robot)
             self._update_paths()
             local[:] = True
-        self._place_within(np.flatnonzero(local & ~self.reachable))
+        self._place_within(np.flatnonzero(local & ~self.reachable), last=not self.reachable.any())
         if not self.reachable.any():
             # What is left lies behind slivers of the unknown: look at it across them.
-            self._place_within(np.arange(c.size), through_unknown=True)
+            self._place_within(np.arange(c.size), through_unknown=True, last=True)
         nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.config.gain == "visible", self.tol, c.gain)
         g.recycle()
 
@@ -498,7 +501,7 @@ class ExplorationMap:
         self._drop_nodes(which[outcome > 0])
         self._set_nodes(which[outcome == 2], node[outcome == 2])
 
-    def _place_within(self, which: np.ndarray, through_unknown: bool = False) -> None:
+    def _place_within(self, which: np.ndarray, through_unknown: bool = False, last: bool = False) -> None:
         """Put nodes at the reachable places nearest to their jump edges that see them; without any they stay masked."""
         if not len(which):
             return
@@ -506,7 +509,12 @@ class ExplorationMap:
         seen = np.isfinite(g.distances(self.robot, np.arange(g.n_vertices)))
         looks, half_view = self._looks[: self.n_looks], 0.5 * self.sensor.field_of_view
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
-        for k, i in enumerate(which):
+        here = g.vertices.position[self.robot]
+        order = np.argsort(np.hypot(*(c.middle[which] - here).T), kind="stable")
+        # On a map in shreds there may be thousands: the nearest will do, and when nothing else is left, a few.
+        for tried, (k, i) in enumerate(zip(order, which[order], strict=True)):
+            if tried == _MOST_TRIED and not last or last and np.count_nonzero(found) == _ENOUGH:
+                break
             *node[k], found[k] = nodes.nearest_reachable(
                 np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, looks, half_view, g.walls,
                 g.pieces, self.tol, through_unknown,
