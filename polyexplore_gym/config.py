@@ -200,6 +200,9 @@ class ExplorationConfig:
     sensor's range at most; None: four radii of the robot."""
     samples: int = 6
     """in_front: fewest beams that must fall on the jump edge (Ekman: 2 without noise, 6 with)."""
+    gain: Literal["whole", "visible"] = "whole"
+    """Angle of another jump edge that counts for a node's gain: the whole of it if its middle is visible (the paper),
+    or that of its visible parts."""
     min_gap: float | None = None
     """Shortest jump edge of interest, m; None: the robot's diameter."""
     look_around: bool = True
@@ -212,6 +215,7 @@ class ExplorationConfig:
     def __post_init__(self) -> None:
         _check_types(self)
         _require(self.placement in ("midpoint", "in_front"), self, "placement", "must be 'midpoint' or 'in_front'")
+        _require(self.gain in ("whole", "visible"), self, "gain", "must be 'whole' or 'visible'")
         ok = self.front_distance is None or self.front_distance > 0
         _require(ok, self, "front_distance", "must be positive or None")
         _require(self.samples >= 1, self, "samples", "must be at least 1")

@@ -40,7 +40,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     terminates when no reachable jump edge is left and is truncated after `EnvConfig.max_decisions`.
     A plan seen whole from the start terminates in the first step, whatever the action, at no cost.
 
-    Version history: v0, the first.
+    Version history: v0, the first. v1: openings instead of chains, a look counts only where it could have shown
+    something, paths through tight doorways, lengths that follow from robot and sensor, swept contact; `info["outcome"]`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # type: ignore[misc]
@@ -68,7 +69,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             InvalidFloorPlanError: the plan cannot be read or is invalid.
         """
         if plan is not None and suite is not None:
-            raise InvalidConfigError(f"a plan and the suite {suite!r}: give one (PolyExplore-Plan-v0 takes a plan)")
+            raise InvalidConfigError(f"a plan and the suite {suite!r}: give one (PolyExplore-Plan-v1 takes a plan)")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidConfigError(f"render_mode {render_mode!r}: must be None, 'rgb_array' or 'human'")
         self.config = (

@@ -124,7 +124,7 @@ def _free_sector(ex, ey, walls, tol):
 def _in_narrows(ex, ey, ux, uy, walls, tol):
     """Distance from a wall end at which its direction u has the most room, and how much: where a passage is narrow.
 
-    Clearance rises and falls once between the end and what faces it: coarse steps, then halving.
+    Clearance rises and falls once between the end and what faces it: coarse steps, then halving where it is tight.
     """
     best = 0.0
     room = -1.0
@@ -136,7 +136,7 @@ def _in_narrows(ex, ey, ux, uy, walls, tol):
             room = c
             best = d
         d += step
-    while step > 0.002 * tol.radius:
+    while room < tol.stand and step > 0.002 * tol.radius:
         step *= 0.5
         for side in (-step, step):
             d = best + side
@@ -232,8 +232,10 @@ def corner_vertices(ends, walls, scans, waited, since, tol):
             y = ey + away * uy
             limit = math.sin(half) + _LEEWAY
             kept = True
-            if clearance(x, y, walls, tol.reach) < tol.stand:
-                narrow = True
+            room = clearance(x, y, walls, tol.reach)
+            # Something else is nearer than the wall end: from one side of a passage to the other no leg need be free.
+            narrow |= room < rho
+            if room < tol.stand:
                 away, room = _in_narrows(ex, ey, ux, uy, walls, tol)
                 x = ex + away * ux
                 y = ey + away * uy

@@ -575,7 +575,7 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
         if out.width[q] < tol.gap:  # else wide enough
             out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
             out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
-            out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
+        out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
         run = 0.0
         out.middle[q, 0] = out.ends[q, 0]
         out.middle[q, 1] = out.ends[q, 1]

@@ -20,7 +20,7 @@ from polyexplore_gym.exploration.scan_polygon import Scans
 from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
-VISIT = 8
+VISIT = 4
 """A measurement made for a jump edge in vain counts so much: an attempt that ended before its node counts one."""
 _AHEAD = 0.5
 """A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
@@ -70,7 +70,7 @@ class JumpEdges(NamedTuple):
     kind: np.ndarray
     """(c,) `scan_polygon` label of most of it."""
     visits: np.ndarray
-    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count an eighth."""
+    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count a quarter."""
     node: np.ndarray
     """(c, 3) position and heading of the node."""
     vertex: np.ndarray
@@ -144,6 +144,10 @@ class ExplorationMap:
         """Openings narrower than this are no jump edges: the robot's diameter, less what noise may take off."""
         n = sensor.beams
         self.n_scans = 0
+        """Scan polygons kept: those that showed something new."""
+        self.n_looks = 0
+        """All scans so far."""
+        self._looks = np.zeros((16, 3))
         self._apexes = np.zeros((16, 2))
         self._headings = np.zeros(16)
         self._points = np.zeros((16, n, 2))
@@ -196,6 +200,7 @@ class ExplorationMap:
         ranges = scan.ranges if ranges is None else ranges
         if point_segment is None:
             point_segment = np.full(len(scan.angles), -1, np.int64)
+        self._remember(scan.pose)
         s = self._store(scan, ranges)
         scans, tol, full = self.scans, self.tol, self.sensor.full_circle
         x, y = float(scan.pose[0]), float(scan.pose[1])
@@ -229,7 +234,10 @@ class ExplorationMap:
         p = p._replace(visits=visits)
         left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
         new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
-        self._rechain(p, dirty, local, left, new, near_walls)
+        if not len(fresh) and not changed.any():
+            self.n_scans -= 1  # its polygon lies within the others: kept, it would only cost memory
+        if len(fresh) or dirty.any():
+            self._rechain(p, dirty, local, left, new, near_walls)
         if target is not None:
             self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
@@ -248,6 +256,12 @@ class ExplorationMap:
     @property
     def _front(self) -> float:
         return self.tol.front if self.config.placement == "in_front" else 0.0
+
+    def _remember(self, pose: np.ndarray) -> None:
+        if self.n_looks == len(self._looks):
+            self._looks = np.concatenate((self._looks, np.zeros_like(self._looks)))
+        self._looks[self.n_looks] = pose
+        self.n_looks += 1
 
     def _store(self, scan: Scan, ranges: np.ndarray) -> int:
         s = self.n_scans
@@ -415,35 +429,31 @@ class ExplorationMap:
         if not self.reachable.any():
             # What is left lies behind slivers of the unknown: look at it across them.
             self._place_within(np.arange(c.size), through_unknown=True)
-        nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.tol, c.gain)
+        nodes.gains(np.flatnonzero(local), c, g.walls, g.pieces, self.config.gain == "visible", self.tol, c.gain)
         g.recycle()
 
     def _look_again(self) -> bool:
-        """Before all ends: what was given up gets one more visit, and slits count. Whether there is any of either."""
+        """Before all ends: what was given up gets one more visit, on the map as it is now. Whether there is any."""
         p, most = self.pieces, VISIT * self.config.max_visits
         again = ~p.settled & ~p.retried & (p.visits >= most)
-        slits = self.least_width > self.tol.slit
-        if not (slits or again.any()):
+        if not again.any():
             return False
-        self.least_width = min(self.least_width, self.tol.slit)
-        before = self.chains.size
         p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
         all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
         self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
-        return self.chains.size > before or bool(again.any())
+        return self.chains.size > 0
 
     def remains(self) -> Remains:
         """The jump edges that are left: out of reach, and given up."""
         c, p = self.chains, self.pieces
-        wide = c.width >= self.tol.gap - 3.0 * self.tol.sigma_range
-        out = wide & ~self.reachable
+        out = ~self.reachable
         given_up = np.flatnonzero(~p.settled & (p.visits >= VISIT * self.config.max_visits))
         order, offsets = jump_edges.link(p.segments[given_up], p.sigma[given_up], self._walls, self.tol)
         rows = given_up[order]
         lost = jump_edges.summarise(
             p.segments[rows], p.kind[rows], p.visits[rows], np.arange(len(rows)), offsets, self._walls, 0, self.tol
         )
-        wide = lost.width >= self.tol.gap - 3.0 * self.tol.sigma_range
+        wide = lost.width >= self.least_width
         return Remains(int(out.sum()), float(c.length[out].sum()), int(wide.sum()), float(lost.length[wide].sum()))
 
     def _way_out(self, x: float, y: float) -> list[tuple[float, float]]:
@@ -494,11 +504,12 @@ class ExplorationMap:
             return
         g, c = self.graph, self.chains
         seen = np.isfinite(g.distances(self.robot, np.arange(g.n_vertices)))
+        looks, half_view = self._looks[: self.n_looks], 0.5 * self.sensor.field_of_view
         node, found = np.zeros((len(which), 3)), np.zeros(len(which), np.bool_)
         for k, i in enumerate(which):
             *node[k], found[k] = nodes.nearest_reachable(
-                np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, self.scans, g.walls, g.pieces,
-                self.tol, through_unknown,
+                np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, looks, half_view, g.walls,
+                g.pieces, self.tol, through_unknown,
             )  # fmt: skip
         if found.any():
             self._drop_vertices(c.vertex[which[found]])

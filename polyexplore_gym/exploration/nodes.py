@@ -12,6 +12,8 @@ from polyexplore_gym.exploration.segments import clearance, crossing_free, norm,
 _FRACTIONS = np.array([0.5, 0.35, 0.65, 0.2, 0.8, 0.08, 0.92])
 _OFFSETS = np.array([0.0, 0.4, 0.8, 1.2, 1.8, 2.4, 3.2, 4.0, 5.2, 6.4, 8.0])
 """Where else to stand for a jump edge: shares of its length, and radii before it."""
+_PARTS = 16
+"""Parts of a jump edge of which each is visible or not."""
 _MARGIN = 0.1
 """A scan must have had a place this far (rad) inside its field of view to have looked there."""
 
@@ -111,21 +113,21 @@ def _joins(x, y, chain, vertices, seen, walls, pieces, tol):
 
 
 @njit(cache=True)
-def looked_from(x, y, tx, ty, scans, tol):
-    """Whether a scan from (x, y) or beside it had (tx, ty) in its field of view: another would show no more."""
-    for s in range(scans.headings.size):
-        dx = scans.apexes[s, 0] - x
-        dy = scans.apexes[s, 1] - y
+def looked_from(x, y, tx, ty, looks, half_view, tol):
+    """Whether a look (k, 3) from (x, y) or beside it had (tx, ty) in its field of view: another would show no more."""
+    for s in range(looks.shape[0]):
+        dx = looks[s, 0] - x
+        dy = looks[s, 1] - y
         if abs(dx) < tol.same_place and abs(dy) < tol.same_place:
-            turn = math.atan2(ty - y, tx - x) - scans.headings[s]
+            turn = math.atan2(ty - y, tx - x) - looks[s, 2]
             turn = math.pi - (math.pi - turn) % (2.0 * math.pi)
-            if scans.full or scans.angles[0] + _MARGIN < turn < scans.angles[-1] - _MARGIN:
+            if half_view >= math.pi or abs(turn) < half_view - _MARGIN:
                 return True
     return False
 
 
 @njit(cache=True)
-def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol, through_unknown):
+def nearest_reachable(rows, i, edges, vertices, seen, looks, half_view, walls, pieces, tol, through_unknown):
     """The reachable place nearest to jump edge i from which it is visible: (x, y, heading, found).
 
     `rows` are its pieces. Tries places before the edge on its known side, then the vertices of the graph in `seen`;
@@ -142,7 +144,7 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
             px, py = point_along(rows, pieces.segments, fraction)
             x = px - offset * tol.radius * nx
             y = py - offset * tol.radius * ny
-            if looked_from(x, y, px + tol.aside * nx, py + tol.aside * ny, scans, tol):
+            if looked_from(x, y, px + tol.aside * nx, py + tol.aside * ny, looks, half_view, tol):
                 continue
             if stands(x, y, px, py, chain, walls, pieces, tol.need, tol) and _joins(
                 x, y, chain, vertices, seen, walls, pieces, tol
@@ -168,7 +170,7 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
             # Only from the known side is the edge a window into the unknown.
             ahead = (mx - vx) * nx + (my - vy) * ny
             visible = (ahead > 0.1 * d or d < tol.on_edge) and sees(vx, vy, tx, ty, walls, pieces, chain, chain, tol)
-        if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, scans, tol):
+        if visible and not looked_from(vx, vy, mx + tol.aside * nx, my + tol.aside * ny, looks, half_view, tol):
             best = d
             bx = vx
             by = vy
@@ -177,11 +179,31 @@ def nearest_reachable(rows, i, edges, vertices, seen, scans, walls, pieces, tol,
 
 
 @njit(cache=True)
-def gains(which, edges, walls, pieces, tol, out):
-    """g_n (Ekman): the sum of the angles that the jump edges subtend at node n where their middle is visible; pi for
-    its own.
+def _seen_angle(x, y, n, i, edges, walls, pieces, tol):
+    """The angle (rad) that the visible parts of jump edge i subtend at node n, of `_PARTS` parts of its chord."""
+    ax, ay, bx, by = edges.ends[i]
+    total = 0.0
+    for part in range(_PARTS):
+        f0 = part / _PARTS
+        f1 = (part + 1) / _PARTS
+        ux = ax + f0 * (bx - ax) - x
+        uy = ay + f0 * (by - ay) - y
+        vx = ax + f1 * (bx - ax) - x
+        vy = ay + f1 * (by - ay) - y
+        mx = x + 0.5 * (ux + vx)
+        my = y + 0.5 * (uy + vy)
+        if norm(mx - x, my - y) <= tol.max_range and sees(x, y, mx, my, walls, pieces, edges.id[n], edges.id[i], tol):
+            total += abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy))
+    return total
 
-    Fills `out` for the chains in `which`; jump edges beyond the maximum range are not seen.
+
+@njit(cache=True)
+def gains(which, edges, walls, pieces, visible, tol, out):
+    """g_n (Ekman): the sum of the angles alpha_ni that the jump edges i subtend at node n; pi for its own.
+
+    alpha_ni is the angle at n of the triangle that n makes with the two ends of edge i (Iles et al.): the whole of it
+    if the middle of the edge is visible from n and within range, else nothing. With `visible` it is the angle of those
+    parts of the edge that are visible. Fills `out` for the chains in `which`.
     """
     for n in which:
         total = math.pi
@@ -192,6 +214,9 @@ def gains(which, edges, walls, pieces, tol, out):
             continue
         for i in range(edges.id.size):
             if i == n:
+                continue
+            if visible:
+                total += _seen_angle(x, y, n, i, edges, walls, pieces, tol)
                 continue
             mx, my = edges.middle[i]
             if norm(mx - x, my - y) > tol.max_range:

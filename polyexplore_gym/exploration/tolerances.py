@@ -29,13 +29,11 @@ class Tolerances(NamedTuple):
     gap: float
     """smallest gap of interest: the disc's diameter"""
 
-    slit: float
-    """before an exploration ends, openings down to this are looked at: through one floor may be seen"""
-
     nudge: float
     """an open edge is resolved where something deeper than this (and the noise) is seen behind it"""
     cover: float
-    """a wall covers open edges along it up to this far: two scans put one wall at two places"""
+    """a wall covers open edges along it up to this far: two scans put one wall at two places. Less than a robot fits
+    through, whatever the noise"""
     join: float
     """ends of open edges nearer than this (and the noise) touch"""
     crumb: float
@@ -127,9 +125,8 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
         sigma_angle=sensor.sigma_angle,
         step=sensor.resolution,
         gap=2.0 * r if config.min_gap is None else config.min_gap,
-        slit=0.6 * r + 6.0 * sensor.sigma_range,
         nudge=0.12 * r,
-        cover=0.16 * r + 3.0 * sensor.sigma_range,
+        cover=0.16 * r + min(3.0 * sensor.sigma_range, 0.3 * r),
         join=0.2 * r,
         crumb=0.08 * r,
         piece=max(8.0 * r, reach / 15.0),

@@ -12,6 +12,7 @@ from exploration_scenes import box, clear_points, free_space, lines_of, scene, w
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import ExplorationMap, scan_polygon, shapes
+from polyexplore_gym.exploration.tolerances import squeezed
 from polyexplore_gym.floorplan import generate
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.laser import cast_rays
@@ -434,3 +435,106 @@ def test_bumps_from_side_to_side_in_a_tight_doorway_lead_back_out():
             back = np.flatnonzero((path == way[0]).all(axis=1))  # where paths begin, and by the shortest way
             assert len(back)
             assert back[0] <= 2
+
+
+# Bumps, what is left, and passages that the noise closes ------------------------------------------
+
+
+def felt(explorer):
+    """The obstacles (k, 4) that were felt, as paths know them."""
+    graph = explorer.map.graph
+    return graph.walls.segments[: graph.felt]
+
+
+def test_a_spot_bumped_at_again_grows_and_paths_lead_round_it():
+    walls = np.vstack([box(-3, -2, 0, 2)[[0, 2, 3]], [[0, -2, 0, -0.9], [0, 0.9, 0, 2]], box(0, -2, 3, 2)[[0, 1, 2]]])
+    explorer = Explorer(walls, [-1.5, 0.0, 0.0], HALF)
+    explorer.look_round()
+    explorer.plan()
+    pose, bearing = np.array([-0.3, 0.0, 0.4]), 0.25
+    spot = pose[:2] + RADIUS * np.array([math.cos(bearing), math.sin(bearing)])
+    across = np.array([math.sin(bearing), -math.cos(bearing)])
+    wanted = []
+    for half in (0.01, 0.02, 0.04, 0.08, 0.16, 0.25, 0.25):  # twice as wide each time, up to the radius
+        explorer.map.bump(pose, bearing)
+        explorer.look()
+        chains = explorer.plan()
+        wanted.append([*(spot + half * across), *(spot - half * across)])
+        np.testing.assert_allclose(felt(explorer), wanted, atol=1e-12)
+        for i in np.flatnonzero(explorer.map.reachable):
+            path = explorer.map.path_to(i)
+            assert lines_of(felt(explorer)).distance(shapely.LineString(path)) >= RADIUS
+    assert chains.size
+    explorer.map.bump(pose, bearing + 0.2)  # a spot 5 cm beside it is another
+    explorer.look()
+    explorer.plan()
+    sizes = np.hypot(*(felt(explorer)[:, 2:] - felt(explorer)[:, :2]).T)
+    assert np.isclose(sizes, 0.02).sum() == 2
+
+
+def test_what_remains_is_what_was_out_of_reach_and_what_was_given_up():
+    # A window of 0.3 m, too narrow for the robot, shows a part of the room behind it.
+    walls = np.vstack([box(-3, -2, 0, 2)[[0, 2, 3]], [[0, -2, 0, 0], [0, 0.3, 0, 2]], box(0, -2, 3, 2)[[0, 1, 2]]])
+    explorer = Explorer(walls, [-1.5, 0.15, 0.0], HALF)
+    e = explorer.map
+    wide = e.chains.width >= e.tol.gap
+    assert wide.any()
+    left = e.remains()  # nothing was planned: nothing is in reach
+    assert (left.unreached, left.given_up, left.given_up_length) == (wide.sum(), 0, 0.0)
+    assert left.unreached_length == pytest.approx(e.chains.length[wide].sum())
+    # One of them is measured in vain until it is given up.
+    row = int(np.flatnonzero(wide)[0])
+    target, length = int(e.chains.id[row]), float(e.chains.length[row])
+    for visit in range(e.config.max_visits):
+        mine = int(np.flatnonzero(e.chains.id == target)[0])
+        assert e.chains.visits[mine] == visit
+        assert e.remains().given_up == 0
+        place = e.chains.middle[mine] - 0.01 * e.chains.normal[mine]
+        explorer.pose = np.array([*place, math.atan2(e.chains.normal[mine, 1], e.chains.normal[mine, 0])])
+        e.insert(blind(explorer), explorer.walls, explorer.alive, np.zeros(0, np.int64), target=target)
+    assert target not in e.chains.id
+    left = e.remains()
+    assert left.given_up == 1
+    assert left.given_up_length == pytest.approx(length)
+    assert left.unreached == wide.sum() - 1
+
+
+def blind(explorer):
+    """A scan that sees nothing beyond 2 cm."""
+    n = explorer.sensor.beams
+    return Scan(explorer.angles, np.full(n, 0.02), explorer.pose.copy(), np.zeros((3, 3)), False)
+
+
+def test_a_doorway_closed_by_noise_is_squeezed_through_when_nothing_else_is_in_reach():
+    """The map has taken 2 cm off each side of a doorway of 2.1 radii."""
+    half, off = 1.05 * RADIUS, 0.02
+    jambs = np.array([[0, -2, 0, -half], [0, half, 0, 2]], float)
+    true = np.vstack([box(-3, -2, 0, 2)[[0, 2, 3]], jambs, box(0, -2, 3, 2)[[0, 1, 2]]])
+    mapped = true.copy()
+    mapped[3, 3] += off
+    mapped[4, 1] -= off
+    sensor = SensorConfig(sigma_range=0.01, sigma_angle=0.0)
+    explorer = Explorer(mapped, [-1.5, 0.0, 0.0], sensor)
+    explorer.look_round()
+    e = explorer.map
+    for _ in range(30):
+        chains = explorer.plan()
+        if e.graph is not e._wide:
+            break
+        assert (chains.node[e.reachable, 0] < 0.0).all()
+        explorer.go(int(np.argmin(chains.path_length)))
+    beyond = np.flatnonzero(e.reachable & (e.chains.node[:, 0] > 0.0))
+    assert len(beyond)
+    for i in beyond:
+        path = shapely.LineString(e.path_to(i))
+        # As far from the walls as they may stand off: contact tells the rest.
+        assert lines_of(e._shortened(mapped)).distance(path) >= squeezed(e.tol).sweep - 1e-9
+        assert lines_of(mapped).distance(path) < RADIUS
+        assert path.crosses(shapely.LineString([(0.0, -half), (0.0, half)]))
+    # With a wide doorway beside it nothing has to be squeezed.
+    wide = np.vstack([mapped[:3], [[0, -2, 0, -1.5], [0, -0.7, 0, -half + off]], mapped[4:]])
+    explorer = Explorer(wide, [-1.5, 0.0, 0.0], sensor)
+    explorer.look_round()
+    explorer.plan()
+    assert explorer.map.reachable.any()
+    assert explorer.map.graph is explorer.map._wide

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 
 import networkx as nx
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import FAMILIES, box, clear_points, free_space, lines_of, scene, shortest_lengths, tol_of
+from exploration_scenes import (
+    FAMILIES,
+    box,
+    clear_points,
+    free_space,
+    lines_of,
+    scene,
+    shortest_lengths,
+    tol_of,
+    turned,
+)
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL
 from polyexplore_gym.exploration.path_graph import PathGraph
+from polyexplore_gym.exploration.tolerances import squeezed
 
 RADIUS = 0.25
 TOL = tol_of(SensorConfig(max_range=8.0), RADIUS)
@@ -135,6 +147,110 @@ def test_every_door_that_is_wide_enough_is_passed(width, thickness, angle):
     walls, turn = room(0.5)
     _, ours = fields(graph_of(walls), points)
     assert np.isinf(ours[:3, 3:]).all()
+
+
+def wall_with_a_door(width, thickness, angle, radius):
+    """Two halls of 12 radii, the wall between them with its door, and points on both sides; turned."""
+    r, t = radius, 0.5 * thickness
+    walls = [box(-12 * r, -8 * r, 12 * r, 8 * r)]
+    for a, b in ((-8 * r, -width / 2), (width / 2, 8 * r)):
+        walls.append(box(-t, a, t, b) if thickness else np.array([[0.0, a, 0.0, b]]))
+    points = r * np.array([[-8, 0.4], [-4, 6.4], [-3.4, -6.7], [8, 0.0], [3.4, 6.7], [6, -6.0]])
+    return turned(np.vstack(walls), angle), turned(np.tile(points, 2), angle)[:, :2]
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.25, 1.0])
+@pytest.mark.parametrize("thickness", [0.0, 0.3, 1.2, 4.0])
+def test_gates_little_wider_than_the_robot_are_passed(radius, thickness):
+    """Doors of 2.04 to 2.4 radii, walls of any thickness (in radii) at any angle; one of 2.01 radii is not passed."""
+    rng = np.random.default_rng([5, int(100 * radius), int(10 * thickness)])
+    tol = tol_of(SensorConfig(max_range=32.0 * radius, sigma_range=0.0, sigma_angle=0.0), radius)
+    for width in (*np.arange(2.04, 2.4, 0.03), 2.4):
+        for angle in (0.0, rng.uniform(0.0, math.pi)):
+            walls, points = wall_with_a_door(width * radius, thickness * radius, angle, radius)
+            graph = graph_of(walls, tol)
+            leaves, ours = fields(graph, points)
+            assert np.isfinite(ours).all(), (width, angle)
+            lines = lines_of(walls)
+            for i, j in itertools.product(range(3), range(3, 6)):
+                way = shapely.LineString(graph.path(int(leaves[i]), int(leaves[j])))
+                assert lines.distance(way) >= radius
+            if angle == 0.0:
+                exact = shortest_lengths(free_space(walls, radius, 16), points)
+                assert (ours <= 1.12 * exact + 0.4 * radius).all()
+    walls, points = wall_with_a_door(2.01 * radius, thickness * radius, 0.7, radius)
+    assert np.isinf(fields(graph_of(walls, tol), points)[1][:3, 3:]).all()
+
+
+def test_squeezed_paths_lead_through_what_the_noise_has_closed():
+    tol = tol_of(SensorConfig(sigma_range=0.01), RADIUS)
+    less = squeezed(tol)
+    assert tol.need - less.need == pytest.approx(0.03)
+    assert tol.sweep - less.sweep == pytest.approx(0.03)
+    assert less._replace(need=tol.need, sweep=tol.sweep) == tol  # nothing else changes
+    assert tol.need - squeezed(tol._replace(sigma_range=1.0)).need == pytest.approx(0.15 * RADIUS)
+    # A doorway of 2.08 radii, of which the map has taken 2 cm on each side.
+    walls, points = wall_with_a_door(2.08 * RADIUS - 0.04, 0.1, 0.4, RADIUS)
+    assert np.isinf(fields(graph_of(walls, tol), points)[1][:3, 3:]).all()
+    assert np.isfinite(fields(graph_of(walls, less), points)[1]).all()
+
+
+# Open edges ---------------------------------------------------------------------------------------
+
+
+def islands(rng, count):
+    """The unknown in the middle of the known: (its area, its boundary as directed open edges (m, 4))."""
+    parts = []
+    for _ in range(count):
+        n = int(rng.integers(3, 7))
+        t = np.sort(rng.uniform(0.0, 2.0 * math.pi, n))
+        corners = rng.uniform(0.3, 1.4, (n, 1)) * np.stack((np.cos(t), np.sin(t)), axis=1)
+        parts.append(shapely.Polygon(corners + rng.uniform(-4.0, 4.0, 2)).buffer(0))
+    area = shapely.union_all(parts).buffer(-0.02).buffer(0.02, join_style="mitre").simplify(0.02)
+    edges = []
+    for part in shapely.get_parts(area):
+        for r in (part.exterior, *part.interiors):
+            p = shapely.get_coordinates(r)
+            if shapely.is_ccw(r) == (r is part.exterior or r.equals(part.exterior)):
+                p = p[::-1]  # the unknown on the right
+            for a, b in itertools.pairwise(p):
+                cuts = np.linspace(a, b, max(math.ceil(math.dist(a, b) / 0.8), 1) + 1)
+                edges += np.hstack([cuts[:-1], cuts[1:]]).tolist()
+    return area, np.array(edges)
+
+
+@pytest.mark.parametrize("family", ["strewn", "furnished", "rooms"])
+def test_paths_round_the_unknown_are_shortest_paths(family):
+    """They turn at bends of the open edges, from which nothing has to be kept."""
+    rng = np.random.default_rng([6, len(family)])
+    ratio, excess, round_about = [], [], 0
+    for seed in range(12):
+        walls = scene(family, seed)
+        unknown, pieces = islands(rng, int(rng.integers(2, 6)))
+        points = clear_points(rng, walls, RADIUS + 0.03, 60)
+        points = points[shapely.distance(unknown, shapely.points(points)) > TOL.slack + 0.01][:11]
+        graph = graph_of(walls, pieces=pieces, owner=np.zeros(len(pieces), np.int64))
+        leaves, ours = fields(graph, points)
+        free = free_space(walls, RADIUS)
+        exact = shortest_lengths(free.difference(unknown), points)
+        wider = shortest_lengths(
+            free_space(walls, RADIUS + 0.03).difference(unknown.buffer(0.03, join_style="mitre")), points
+        )
+        inner = unknown.buffer(-1e-6)
+        for i, j in itertools.combinations(range(len(points)), 2):
+            if np.isfinite(ours[i, j]):
+                way = shapely.LineString(graph.path(int(leaves[i]), int(leaves[j])))
+                assert not way.intersects(inner)
+                assert ours[i, j] >= exact[i, j] - 0.01
+            assert np.isfinite(ours[i, j]) or np.isinf(wider[i, j]), (seed, i, j)
+            if np.isfinite(wider[i, j]):
+                ratio.append(ours[i, j] / wider[i, j])
+                excess.append(ours[i, j] - 1.06 * wider[i, j])
+        round_about += (exact > shortest_lengths(free, points) + 0.05)[np.isfinite(exact)].sum()
+    assert round_about > 100
+    assert np.mean(ratio) < 1.02
+    # A bend that stands too near to a wall has no vertex: very few paths go another way.
+    assert np.mean(np.array(excess) > 0.15) < 0.01
 
 
 def test_open_edges_block_until_they_are_gone_and_never_their_owner():
