@@ -210,7 +210,7 @@ def compare(exploration: ExplorationMap, known: Any, tally: Tally, name: str) ->
         if np.isfinite(upper[i]) and length > tally.worst * upper[i]:
             tally.worst, tally.worst_at = length / upper[i], at
         tally.long += bool(length > MOST * upper[i])
-        if length < tally.least * lower[i]:
+        if not np.isfinite(lower[i]) or length < tally.least * lower[i]:
             tally.least, tally.least_at = (length / lower[i] if np.isfinite(lower[i]) else 0.0), at
         tally.short += bool(length < LEAST * lower[i])
 
