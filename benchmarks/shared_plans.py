@@ -1,12 +1,12 @@
 """Does every exploration end by itself? All scripted criteria on all shared plans, through the evaluation library.
 
     python benchmarks/shared_plans.py [--policies nearest ...] [--placement midpoint in_front] [--drive physics]
-                                      [--noise 1] [--first N] [--workers 2] [--out results/shared_plans]
+                                      [--noise 1] [--exact] [--first N] [--workers 2] [--out results/shared_plans]
 
 One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
 coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
-where it stood to measure and anywhere on the way (below 0: overlap), and bumps a decision. `--noise` scales the laser's
-noise of range and angle. A run that was stopped goes on where it was with the same arguments.
+where it stood to measure and anywhere on the way (below 0: overlap), bumps a decision, and with `--exact` the most floor
+that one place within reach would still show (`exact.py`). `--noise` scales the laser's noise of range and angle. A run that was stopped goes on where it was with the same arguments.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout.
@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import exact
 import gymnasium
 import numpy as np
 import shapely
@@ -43,9 +44,9 @@ Key = tuple[str, int]
 class Watched(gymnasium.Wrapper):
     """Writes down the smallest clearance of the disc when an episode ends."""
 
-    def __init__(self, env: PolyExploreEnv, file: Path) -> None:
+    def __init__(self, env: PolyExploreEnv, file: Path, exact: bool) -> None:
         super().__init__(env)
-        self.file = file
+        self.file, self.exact = file, exact
         self._seed: int | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -68,6 +69,7 @@ class Watched(gymnasium.Wrapper):
             "key": [env.plan.content_hash, self._seed],
             "standing": float(env.plan.clearance(snapshot.measured_at[:, :2]).min()) - snapshot.radius,
             "on the way": clearance(snapshot.trajectory, env.plan, snapshot.radius),
+            "left": exact.check(env).area if self.exact else 0.0,
         }
         with self.file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
@@ -78,9 +80,10 @@ class MakeWatched:
     """Makes the environment for the evaluation; a folder is of one policy and placement."""
 
     folder: Path
+    exact: bool
 
     def __call__(self, config: EnvConfig) -> gymnasium.Env:
-        return Watched(PolyExploreEnv(config=config), self.folder / CLEARANCES)
+        return Watched(PolyExploreEnv(config=config), self.folder / CLEARANCES, self.exact)
 
 
 def clearance(trajectory: np.ndarray, plan: FloorPlan, radius: float) -> float:
@@ -93,20 +96,20 @@ def clearance(trajectory: np.ndarray, plan: FloorPlan, radius: float) -> float:
     return float(distances.min()) - radius
 
 
-def read_clearances(folder: Path) -> dict[Key, tuple[float, float]]:
-    """Clearance standing and on the way, m; an episode played again counts once, a torn last line not at all."""
-    known: dict[Key, tuple[float, float]] = {}
+def read_clearances(folder: Path) -> dict[Key, tuple[float, float, float]]:
+    """Clearance standing and on the way, m, and what one place would still show, m2; an episode played again counts once, a torn last line not at all."""
+    known: dict[Key, tuple[float, float, float]] = {}
     file = folder / CLEARANCES
     for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
         try:
             entry = json.loads(line)
         except ValueError:
             continue
-        known[tuple(entry["key"])] = entry["standing"], entry["on the way"]
+        known[tuple(entry["key"])] = entry["standing"], entry["on the way"], entry["left"]
     return known
 
 
-def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, float]]) -> list[str]:
+def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, float, float]]) -> list[str]:
     """The figures of one policy and placement."""
     played = [r for r in records if r.status != "failed"]
     ended = [r for r in records if r.ended]
@@ -114,9 +117,9 @@ def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, flo
              f"{sum(not r.complete for r in ended)}", f"{len(records) - len(played)}",
              f"{sum(r.status == 'truncated' for r in records)}"]  # fmt: skip
     if not played:
-        return [*cells, "-", "-", "-", "-", "-"]
+        return [*cells, "-", "-", "-", "-", "-", "-"]
     least = min(played, key=lambda r: r.coverage)
-    standing, moving = zip(*(clearances[r.plan_hash, r.seed] for r in played), strict=True)
+    standing, moving, left = zip(*(clearances[r.plan_hash, r.seed] for r in played), strict=True)
     decisions = sum(r.decisions for r in played)
     return [
         *cells,
@@ -125,6 +128,7 @@ def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, flo
         f"{1e3 * min(standing):.2f}",
         f"{1e3 * min(moving):.2f} ({played[moving.index(min(moving))].plan})",
         f"{sum(r.collisions for r in played) / max(decisions, 1):.3f}",
+        f"{max(left):.2f} ({played[left.index(max(left))].plan})",
     ]
 
 
@@ -135,6 +139,7 @@ def main() -> None:
     parser.add_argument("--drive", choices=("physics", "kinematic"), default="physics")
     parser.add_argument("--noise", type=float, default=1.0, help="factor of the laser's noise; 0 for none")
     parser.add_argument("--seeds", type=int, default=1, help="starts on each plan")
+    parser.add_argument("--exact", action="store_true", help="also look for places that would show more (exact.py)")
     parser.add_argument("--first", type=int, help="only the first so many plans")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--plans", type=Path, default=default_folder(), help="folder of plan JSON files")
@@ -158,13 +163,13 @@ def main() -> None:
             study = Study(policies={policy: policy}, plans=plans, placements=[placement],
                           seeds=range(options.seeds), config=config)  # fmt: skip
             folder = out / f"{policy.replace(':', '_')}-{placement}"
-            records = evaluate(study, out=folder, workers=options.workers, make_env=MakeWatched(folder))
+            records = evaluate(study, out=folder, workers=options.workers, make_env=MakeWatched(folder, options.exact))
             rows.append(row(records, read_clearances(folder)))
             failed += [r for r in records if not r.complete]
     print(f"\n{len(plans)} plans x {options.seeds} starts, {options.drive}, {options.noise:g} x the laser's noise:\n")
     header = ("policy", "placement", "ended by itself", "with edges left", "exceptions", "truncated", "seen, median %",
               "seen, least % (plan)", "clearance standing, least mm", "on the way, least mm (plan)",
-              "bumps a decision")  # fmt: skip
+              "bumps a decision", "still to be seen from one place, most m2")  # fmt: skip
     print(format_table(header, rows, "markdown"))
     for r in failed:
         print(f"\n{r.status}: {r.policy}, {r.placement}, {r.plan}, seed {r.seed}: "

@@ -513,7 +513,7 @@ class ExplorationMap:
         order = np.argsort(np.hypot(*(c.middle[which] - here).T), kind="stable")
         # On a map in shreds there may be thousands: the nearest will do, and when nothing else is left, a few.
         for tried, (k, i) in enumerate(zip(order, which[order], strict=True)):
-            if tried == _MOST_TRIED and not last or last and np.count_nonzero(found) == _ENOUGH:
+            if (tried == _MOST_TRIED and not last) or (last and np.count_nonzero(found) == _ENOUGH):
                 break
             *node[k], found[k] = nodes.nearest_reachable(
                 np.flatnonzero(self.pieces.owner == c.id[i]), i, c, g.vertices, seen, looks, half_view, g.walls,
