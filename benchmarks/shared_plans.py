@@ -5,8 +5,9 @@
 
 One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
 coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
-where it stood to measure and anywhere on the way (below 0: overlap), bumps a decision, and with `--exact` the most floor
-that one place within reach would still show (`exact.py`). `--noise` scales the laser's noise of range and angle. A run that was stopped goes on where it was with the same arguments.
+where it stood to measure and anywhere on the way (below 0: overlap), bumps a decision, and with `--exact` the most
+floor that one place within reach would still show (`exact.py`). `--noise` scales the laser's noise of range and angle.
+A run that was stopped goes on where it was with the same arguments.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout.
@@ -97,7 +98,10 @@ def clearance(trajectory: np.ndarray, plan: FloorPlan, radius: float) -> float:
 
 
 def read_clearances(folder: Path) -> dict[Key, tuple[float, float, float]]:
-    """Clearance standing and on the way, m, and what one place would still show, m2; an episode played again counts once, a torn last line not at all."""
+    """Clearance standing and on the way, m, and what one place would still show, m2.
+
+    An episode played again counts once, a torn last line not at all.
+    """
     known: dict[Key, tuple[float, float, float]] = {}
     file = folder / CLEARANCES
     for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
