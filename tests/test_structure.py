@@ -192,7 +192,7 @@ def test_the_maps_have_no_way_to_the_truth():
             found = graph[todo.pop()] - seen
             seen |= found
             todo += found
-        assert {part(name) for name in seen} <= {start, "config", "errors", "presets", "scan"}
+        assert {part(name) for name in seen} <= {start, "config", "errors", "presets", "robot_map", "scan"}
 
 
 def test_scripted_policies_act_on_the_observation_alone():

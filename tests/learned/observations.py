@@ -24,9 +24,10 @@ def environment(plan: int = 3, decisions: int = 4, seed: int = 0) -> tuple[PolyE
 
 @functools.cache
 def observation(plan: int = 3, decisions: int = 4) -> dict[str, np.ndarray]:
-    """What is seen there; with at least three nodes to choose from."""
-    seen = environment(plan, decisions)[1]
-    assert seen["action_mask"].sum() >= 3
+    """What is seen there, or as soon as there are three nodes or more to choose from."""
+    env, seen = environment(plan, decisions)
+    while seen["action_mask"].sum() < 3:
+        seen, *_ = env.step(nearest([seen])[0])
     return seen
 
 
