@@ -91,12 +91,14 @@ class RobotConfig:
     max_turn_acceleration: float = math.radians(300.0)
     """Largest angular acceleration, rad/s2."""
     mass: float = 9.0
-    """Mass, kg (data sheet). No motion depends on it: wheels do not slip, walls neither rub nor bounce."""
+    """Mass, kg (data sheet), 0.001 to 1,000,000: of the body that pymunk holds off the walls. The impulses of a contact
+    are in proportion to it; the way is not, since wheels do not slip and walls are fixed and neither rub nor bounce."""
 
     def __post_init__(self) -> None:
         _check_types(self)
         for f in dataclasses.fields(self):
             _require(getattr(self, f.name) > 0, self, f.name, "must be positive")
+        _require(1e-3 <= self.mass <= 1e6, self, "mass", "must lie in [0.001, 1e6] kg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

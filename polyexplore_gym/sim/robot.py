@@ -233,7 +233,7 @@ def bounded(segments, x, y, dx, dy, vx, vy, left, radius):  # type: ignore[no-un
     wanted = math.hypot(dx, dy)
     depth = _PARALLEL * wanted
     given = vx * (dx - vx) + vy * (dy - vy)  # by walls that push; those that only hold give nothing
-    if not (given >= -depth * wanted and _into_none(touched, vx, vy, depth)):
+    if not (given >= -depth * min(math.hypot(vx, vy), wanted) and _into_none(touched, vx, vy, depth)):
         vx, vy = _allowed(touched, dx, dy)
     if math.hypot(vx, vy) <= depth:
         return 0.0, 0.0, left

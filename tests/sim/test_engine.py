@@ -128,7 +128,7 @@ def test_a_wall_takes_what_leads_into_it_and_no_more() -> None:
     np.testing.assert_allclose(got[1:], [[3.0, 4.0]])
 
 
-@pytest.mark.parametrize("mass", [0.1, 9.0, 5000.0])
+@pytest.mark.parametrize("mass", [1e-3, 9.0, 1e6])
 def test_the_impulse_of_a_wall_follows_from_the_mass_and_the_way_does_not(mass: float) -> None:
     engine = Engine(RobotConfig(mass=mass), np.array([[-5.0, 0.0, 5.0, 0.0]]))
     rows = engine.step(np.array([0.0, 0.26, -math.pi / 6, 2.0]), 0.1)
