@@ -25,6 +25,9 @@ VISIT = 4
 _MOST_TRIED, _ENOUGH = 64, 8
 """For so many jump edges without a node another place is looked for at most, and so many are enough where there is no
 other: they are as many as an observation holds."""
+_LONGEST_WAY, _LONGEST_TRAIL = 20_000, 3_000
+"""So many poses of the way back are looked at, and so many places of it laid into the graph: a robot that bumps about on
+a drifted map has driven for ever."""
 _AHEAD = 0.5
 """A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
 
@@ -168,6 +171,7 @@ class ExplorationMap:
         self._trail: list[np.ndarray] = []
         self._touched: list[np.ndarray] = []
         self._felt: list[tuple[float, float, float, float, float]] = []
+        self._felt_again = False
         self._walls = np.zeros((0, 4))
         self._box = _no_box()
 
@@ -232,7 +236,11 @@ class ExplorationMap:
         dirty[rows[shown & ~p.settled[rows]]] = True
         if target is not None:
             mine = p.owner == target
-            visits[mine] += VISIT if arrived and self._measured(target, x, y) else 1
+            if arrived and self._measured(target, x, y):
+                visits[mine] += VISIT
+            elif not self._felt_again:  # else the spot is to blame, not the edge: felt walls close it in the end
+                visits[mine] += 1
+            self._felt_again = False
             dirty |= mine
         p = p._replace(visits=visits)
         left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
@@ -326,7 +334,9 @@ class ExplorationMap:
         x, y = pose[0] + r * c, pose[1] + r * s
         half = 0.04 * r
         for fx, fy, before, _, _ in self._felt:
-            if math.hypot(fx - x, fy - y) < 0.08 * r:
+            away = math.hypot(fx - x, fy - y)
+            self._felt_again |= away < 0.3 * r
+            if away < 0.08 * r:
                 half = max(half, min(2.0 * before, r))
         self._felt.append((x, y, half, c, s))
         for graph in (self._wide, self._tight):
@@ -425,7 +435,7 @@ class ExplorationMap:
         self._place(np.flatnonzero(local))
         self._update_paths()
         if c.size and not self.reachable.any() and self._trail:
-            g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step), self.robot)
+            g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step)[-_LONGEST_TRAIL:], self.robot)
             self._update_paths()
             local[:] = True
         self._place_within(np.flatnonzero(local & ~self.reachable), last=not self.reachable.any())
@@ -471,7 +481,8 @@ class ExplorationMap:
         points, driven = [(x, y)], [0.0]
         grain = 1.0 / self.tol.same_point
         been = {(round(x * grain), round(y * grain)): 0}
-        for px, py in itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail)):
+        back = itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail))
+        for px, py in itertools.islice(back, _LONGEST_WAY):
             spot = round(px * grain), round(py * grain)
             if spot in been:  # a loop: it led back here
                 first = been[spot]
