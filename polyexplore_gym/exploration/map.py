@@ -26,8 +26,8 @@ _MOST_TRIED, _ENOUGH = 64, 8
 """For so many jump edges without a node another place is looked for at most, and so many are enough where there is no
 other: they are as many as an observation holds."""
 _LONGEST_WAY, _LONGEST_TRAIL = 20_000, 3_000
-"""So many poses of the way back are looked at, and so many places of it laid into the graph: a robot that bumps about on
-a drifted map has driven for ever."""
+"""So many poses of the way back are looked at, and so many places of it laid into the graph: a robot that bumps about
+on a drifted map has driven for ever."""
 _AHEAD = 0.5
 """A look from farther than `on_edge` measures a jump edge only with this cosine or more to its normal."""
 
