@@ -47,7 +47,7 @@ def test_constructors_check_types(part):
 def check_own_types(part, name):
     kind = typing.get_type_hints(part)[name]
     default = getattr(part(), name)
-    if kind in (int, float, bool) or name == "min_gap":
+    if kind in (int, float, bool) or kind == float | None:
         wrong = {int: (True, 1.5, "1", None), float: (True, "1", None), bool: (1, "True", None)}
         for value in wrong.get(kind, (True, "1")):
             with pytest.raises(InvalidConfigError, match=rf"{part.__name__}\.{name} = .*: expected"):

@@ -129,7 +129,7 @@ def test_commands_run_in_order(reader, capsys):
             words[words.index("--first") + 1] = "1"
         capsys.readouterr()
         assert cli.main([*words, *extra]) == 0, command
-        told = {"run": "distance", "bench": "IQM", "linemap": "compression", "report": "written"}
+        told = {"run": "distance", "bench": "IQM", "linemap": "compression", "report": "written", "plan": "written"}
         assert told[words[0]] in capsys.readouterr().out
         for option in ("--png", "--out"):
             if option in words:

@@ -20,11 +20,13 @@ from polyexplore_gym.exploration.scan_polygon import Scans
 from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
-VISIT = 4
+VISIT = 2
 """A measurement made for a jump edge in vain counts so much: an attempt that ended before its node counts one."""
 _MOST_TRIED, _ENOUGH = 64, 8
 """For so many jump edges without a node another place is looked for at most, and so many are enough where there is no
 other: they are as many as an observation holds."""
+_PATIENCE = 5
+"""So often in a row the robot may bump at one spot before that is held against the jump edges that it set out for."""
 _LONGEST_WAY, _LONGEST_TRAIL = 20_000, 3_000
 """So many poses of the way back are looked at, and so many places of it laid into the graph: a robot that bumps about
 on a drifted map has driven for ever."""
@@ -76,7 +78,7 @@ class JumpEdges(NamedTuple):
     kind: np.ndarray
     """(c,) `scan_polygon` label of most of it."""
     visits: np.ndarray
-    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count a quarter."""
+    """(c,) measurements made for it in vain, rounded up; attempts that ended before its node count half."""
     node: np.ndarray
     """(c, 3) position and heading of the node."""
     vertex: np.ndarray
@@ -172,6 +174,7 @@ class ExplorationMap:
         self._touched: list[np.ndarray] = []
         self._felt: list[tuple[float, float, float, float, float]] = []
         self._felt_again = False
+        self._stuck = 0
         self._walls = np.zeros((0, 4))
         self._box = _no_box()
 
@@ -238,8 +241,9 @@ class ExplorationMap:
             mine = p.owner == target
             if arrived and self._measured(target, x, y):
                 visits[mine] += VISIT
-            elif not self._felt_again:  # else the spot is to blame, not the edge: felt walls close it in the end
-                visits[mine] += 1
+            elif not self._felt_again or self._stuck > _PATIENCE:
+                visits[mine] += 1  # else the spot is to blame, not the edge: what is felt closes it in the end
+            self._stuck = self._stuck + 1 if self._felt_again else 0
             self._felt_again = False
             dirty |= mine
         p = p._replace(visits=visits)
@@ -335,13 +339,18 @@ class ExplorationMap:
         half = 0.04 * r
         for fx, fy, before, _, _ in self._felt:
             away = math.hypot(fx - x, fy - y)
-            self._felt_again |= away < 0.3 * r
+            self._felt_again |= away < 0.3 * r and self._still_there(pose)
             if away < 0.08 * r:
                 half = max(half, min(2.0 * before, r))
         self._felt.append((x, y, half, c, s))
         for graph in (self._wide, self._tight):
             if graph is not None:
                 self._put_felt(graph, x, y, half, c, s)
+
+    def _still_there(self, pose: np.ndarray) -> bool:
+        """Whether the robot stands where its last scan was made: it got nowhere."""
+        last = self._looks[self.n_looks - 1]
+        return math.hypot(pose[0] - last[0], pose[1] - last[1]) < 0.4 * self.tol.radius
 
     def _put_felt(self, graph: PathGraph, x: float, y: float, half: float, c: float, s: float) -> None:
         # Felt walls stand where they are: no path may squeeze into them.

@@ -30,19 +30,17 @@ def beside(
     x: float, y: float, resolution: float, fits: np.ndarray, var_range: float, var_angle: float, door: float,
     out: np.ndarray, count: int,
 ) -> int:  # fmt: skip
-    """As `lone`, but along the line on which the return lies, if there is one that the piece would stick out of.
-
-    On a line means within 3 sigma, and out of it farther than that: a wide piece, far off on an oblique wall.
-    """
+    """As `lone`, but along the line on which the return lies (within 3 sigma), if there is one: far off on an oblique
+    wall a piece across the beam would stick out of it."""
     d = math.hypot(x, y)
     best, least, half = -1, ATTACH, 0.5 * min(max(resolution, LEAST * door / d), WIDEST * door / d)
     for i in range(fits.shape[0]):
         if fits[i, 8] == 0:
             continue
         ca, sa = math.cos(fits[i, 1]), math.sin(fits[i, 1])
-        e, out_of = x * ca + y * sa - fits[i, 0], half * (y * ca - x * sa)
+        e = x * ca + y * sa - fits[i, 0]
         variance = normal_variance(x, y, ca, sa, var_range, var_angle)
-        if e * e < least * variance and out_of * out_of > ATTACH * variance:
+        if e * e < least * variance:
             best, least = i, e * e / variance
     if best < 0:
         return lone(x, y, resolution, door, out, count)

@@ -201,19 +201,17 @@ def shortest_lengths(area: shapely.Geometry, points: np.ndarray) -> np.ndarray:
 def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
     """Width of the opening behind a chain of open edges (m, 4) in order: the gaps in it and on to the walls count.
 
-    What runs round the tip of a shadow is as wide as its bounding box at most, crumbs far apart as twice their length.
+    What runs round the tip of a shadow is as wide as its bounding box at most, crumbs as 1.6 times their length.
     """
     edges = shapely.linestrings(chain.reshape(-1, 2, 2))
     total = shapely.length(edges).sum()
     gaps = sum(math.dist(a[2:], b[:2]) for a, b in itertools.pairwise(chain))
     x0, y0, x1, y1 = shapely.total_bounds(edges)
     width = min(total + gaps, math.hypot(x1 - x0, y1 - y0))
-    if width >= tol.gap:
-        return float(width)
-    for end in (chain[0, :2], chain[-1, 2:]):
+    for end in (chain[0, :2], chain[-1, 2:]) if width < tol.gap else ():
         away = lines_of(walls).distance(shapely.Point(end)) if len(walls) else math.inf
         width += away if away < tol.cover + tol.join else 0.0
-    return float(min(width, 2.0 * total))
+    return float(min(width, 1.6 * total))
 
 
 # Star polygons ------------------------------------------------------------------------------------

@@ -94,7 +94,8 @@ def test_never_into_a_wall_whatever_the_engine_answers(
             angle = rng.uniform(-math.pi, math.pi)
             way = longest * radius * rng.uniform() * np.array([math.cos(angle), math.sin(angle)])
             got = stepped(engine, start, way)
-            assert shapely.distance(lines, shapely.linestrings(got)) > radius * (1 - 1e-9)
+            # (Rounding grows with the motion.)
+            assert shapely.distance(lines, shapely.linestrings(got)) > radius * (1 - 1e-9 - 1e-10 * longest)
             assert np.hypot(*np.diff(got, axis=0).T).sum() <= math.hypot(*way) * (1 + 1e-9)
             assert (np.diff(got, axis=0) @ way >= -1e-12 * radius * math.hypot(*way)).all()
             if wrong is not stands_still:
