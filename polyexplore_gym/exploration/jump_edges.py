@@ -331,7 +331,8 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     """Replace the `local` rows of `pieces` by what is `left` of them, add the `fresh` ones, chain what changed anew.
 
     `dirty` (m,) marks rows that changed; `left` are pieces in the order of the local rows they come from, with that
-    row in place of the owner. A piece that is settled or was visited `max_visits` half times in vain is in no chain.
+    row in place of the owner. A piece that is settled or was visited `max_visits` half times in vain is in no chain;
+    openings narrower than `tol.trifle` are forgotten.
     Returns the new pieces (those of a chain together and in order), and the new chains, numbered from `next_id` on.
     """
     m = pieces.kind.size
@@ -380,10 +381,16 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     rows = np.flatnonzero(stale)
     order, offsets = link(p.segments[rows], p.sigma[rows], walls, tol)
     new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
+    keep = np.ones(n, np.bool_)
+    for i in range(n):
+        size = math.hypot(p.segments[i, 2] - p.segments[i, 0], p.segments[i, 3] - p.segments[i, 1])
+        keep[i] = not p.settled[i] or size >= tol.trifle
     for q in range(new.id.size):
         for e in range(offsets[q], offsets[q + 1]):
             p.owner[rows[order[e]]] = new.id[q]
+            keep[rows[order[e]]] = new.width[q] >= tol.trifle
     arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
+    arranged = arranged[keep[arranged]]
     return (
         Pieces(
             p.segments[arranged], p.kind[arranged], p.sigma[arranged], p.visits[arranged], p.settled[arranged],

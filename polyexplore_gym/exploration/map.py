@@ -53,6 +53,11 @@ def _near(segments, alive, x, y, reach):
     return rows[:count].copy()
 
 
+def _length(segments: np.ndarray) -> float:
+    """Length of segments (m, 4) together, m."""
+    return float(np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]).sum())
+
+
 def _resampled(way: np.ndarray, step: float) -> np.ndarray:
     """Points (k, 2) of a way every `step` m, and the last: the same ones again when the way has grown."""
     run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
@@ -249,8 +254,8 @@ class ExplorationMap:
         p = p._replace(visits=visits)
         left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
         new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
-        if not len(fresh) and not changed.any():
-            self.n_scans -= 1  # its polygon lies within the others: kept, it would only cost memory
+        if _length(fresh) + _length(p.segments[local]) - _length(kept) < tol.gap:
+            self.n_scans -= 1  # its polygon lies within the others, but for slivers: kept, it would only cost memory
         if len(fresh) or dirty.any():
             self._rechain(p, dirty, local, left, new, near_walls)
         if target is not None:

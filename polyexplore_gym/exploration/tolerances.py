@@ -38,6 +38,8 @@ class Tolerances(NamedTuple):
     """ends of open edges nearer than this (and the noise) touch"""
     crumb: float
     """what is left of a clipped open edge below this length is dropped: the joins close over it"""
+    trifle: float
+    """an opening narrower than this is forgotten: noise leaves some with every scan"""
     piece: float
     """open edges are cut into pieces of at most this length: some to a robot's surroundings, some to a range"""
     sagitta: float
@@ -129,6 +131,7 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
         cover=0.16 * r + min(3.0 * sensor.sigma_range, 0.3 * r),
         join=0.2 * r,
         crumb=0.08 * r,
+        trifle=0.24 * r,
         piece=max(8.0 * r, reach / 15.0),
         sagitta=0.12 * r,
         surface=0.2 * r,
