@@ -254,7 +254,7 @@ class ExplorationMap:
         p = p._replace(visits=visits)
         left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
         new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
-        if _length(fresh) + _length(p.segments[local]) - _length(kept) < tol.gap:
+        if _length(fresh) + _length(p.segments[local]) - _length(kept) < 2.0 * tol.trifle:
             self.n_scans -= 1  # its polygon lies within the others, but for slivers: kept, it would only cost memory
         if len(fresh) or dirty.any():
             self._rechain(p, dirty, local, left, new, near_walls)

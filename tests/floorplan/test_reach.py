@@ -104,7 +104,8 @@ def test_the_trimmed_floor_is_what_the_disc_sweeps_and_its_corners(seed, radius)
     total = sum(part.area for part in floor)
     assert loss.kept == pytest.approx(kept.area / total)
     for part in left_out:
-        assert part.difference(swept).intersection(kept).area < 0.02 * part.area + 1e-3
+        # (But for a corner that the disc does not sweep.)
+        assert part.difference(swept).intersection(kept).area < 0.02 * part.area + 1e-3 + 0.03 * radius**2
     if loss.passage:
         # A disc that is a little smaller gets there, one a little larger does not.
         home, target = main.representative_point(), shapely.Point(loss.at)
