@@ -27,7 +27,7 @@ _MOST_TRIED, _ENOUGH = 64, 8
 other: they are as many as an observation holds."""
 _PATIENCE = 5
 """So often in a row the robot may bump at one spot before that is held against the jump edges that it set out for."""
-_LONGEST_WAY, _LONGEST_TRAIL = 20_000, 30_000
+_LONGEST_WAY, _LONGEST_TRAIL = 20_000, 200_000
 """So many poses of the way back are looked at, and so many places of it laid into the graph: a robot that bumps about
 on a drifted map has driven for ever."""
 _AHEAD = 0.5
