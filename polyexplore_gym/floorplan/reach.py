@@ -18,6 +18,7 @@ import shapely.ops
 
 from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
 from polyexplore_gym.floorplan.model import PASSABLE, pockets, polygons
+from polyexplore_gym.floorplan.validation import MIN_AREA
 
 LEAST = 0.45
 """Less than this share of the floor is not taken for the plan. A half stays of two equal rooms with a narrow door."""
@@ -103,6 +104,7 @@ def trim(
         InvalidFloorPlanError: no room for the robot.
     """
     disc = PASSABLE * radius
+    floor = [_without_specks(polygon) for polygon in floor]
     parts = _stands(floor, disc)
     if not parts:
         raise InvalidFloorPlanError(f"no room for a robot of radius {radius:g} m")
@@ -141,7 +143,13 @@ def _without_pockets(
 
 def _around(geometry: shapely.Geometry, main: shapely.Polygon) -> shapely.Polygon:
     """The polygon of the geometry that holds the main part."""
-    return max(polygons(geometry), key=lambda part: part.intersection(main).area)
+    return _without_specks(max(polygons(geometry), key=lambda part: part.intersection(main).area))
+
+
+def _without_specks(polygon: shapely.Polygon) -> shapely.Polygon:
+    """Without the holes that are too small for a plan: unions and differences leave some where edges almost meet."""
+    holes = [ring for ring in polygon.interiors if shapely.Polygon(ring).area >= MIN_AREA]
+    return polygon if len(holes) == len(polygon.interiors) else shapely.Polygon(polygon.exterior, holes)
 
 
 def _main_first(parts: list[shapely.Polygon], main: shapely.Polygon) -> list[shapely.Polygon]:

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import shapely
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from polyexplore_gym.errors import FloorPlanWarning, InvalidFloorPlanError
@@ -78,6 +78,8 @@ def test_negligible_pockets_leave_the_plan_as_it_is(tmp_path):
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 0.6))
+@example(98664, 0.5)
+@example(1927581953, 0.1474443362671489)
 @settings(max_examples=80, deadline=None)
 def test_the_trimmed_floor_is_what_the_disc_sweeps_and_its_corners(seed, radius):
     rng = np.random.default_rng(seed)
@@ -95,11 +97,13 @@ def test_the_trimmed_floor_is_what_the_disc_sweeps_and_its_corners(seed, radius)
     main = max(stands, key=lambda part: part.area)
     swept = main.buffer(PASSABLE * radius * 0.99)
     assert swept.difference(kept).area < 1e-6
-    assert kept.difference(shapely.union_all(floor)).area < 1e-9
+    # (Holes too small for a plan are filled.)
+    assert kept.difference(shapely.union_all(floor)).area < 1e-6
     left_out = pockets(sorted(stands, key=lambda part: -part.area))
     assert (loss is not None) == bool(left_out)
     if loss is None:
-        assert any(kept.equals(part) for part in floor)
+        # But for holes that are too small for a plan.
+        assert any(kept.symmetric_difference(part).area < 1e-6 for part in floor)
         return
     total = sum(part.area for part in floor)
     assert loss.kept == pytest.approx(kept.area / total)
