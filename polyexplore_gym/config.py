@@ -210,7 +210,13 @@ class ExplorationConfig:
     look_around: bool = True
     """Measure all round at the start by turning on the spot (a 180 degree sensor scans twice)."""
     scan_every: float = 0.0
-    """Also measure every so many metres of the way, m; 0: at nodes only (the paper)."""
+    """Also measure every so many metres of the way, m, without stopping, and while turning as often as the field of
+    view asks for; 0: at nodes only (the paper)."""
+    decide: Literal["arrival", "settled", "interval"] = "arrival"
+    """When the next node is chosen. `arrival`: at the node (the paper). `settled`: also on the way, as soon as a scan
+    has shown what the node was for. `interval`: also every `decide_every` metres."""
+    decide_every: float = 1.0
+    """interval: the node is chosen anew every so many metres of the way, m, at the next scan."""
     max_visits: int = 2
     """A jump edge measured or attempted in vain this often is given up."""
 
@@ -222,7 +228,12 @@ class ExplorationConfig:
         _require(ok, self, "front_distance", "must be positive or None")
         _require(self.samples >= 1, self, "samples", "must be at least 1")
         _require(self.min_gap is None or self.min_gap > 0, self, "min_gap", "must be positive or None")
-        _require(self.scan_every == 0 or self.scan_every >= 0.1, self, "scan_every", "must be 0 or at least 0.1")
+        _require(self.scan_every == 0 or self.scan_every >= 0.01, self, "scan_every", "must be 0 or at least 0.01")
+        known = ("arrival", "settled", "interval")
+        _require(self.decide in known, self, "decide", "must be 'arrival', 'settled' or 'interval'")
+        needs = f"{self.decide!r} needs scans on the way: give scan_every, such as 0.5"
+        _require(self.decide == "arrival" or self.scan_every > 0, self, "decide", needs)
+        _require(self.decide_every > 0, self, "decide_every", "must be positive")
         _require(self.max_visits >= 1, self, "max_visits", "must be at least 1")
 
 

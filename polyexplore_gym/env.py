@@ -22,13 +22,17 @@ from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
 from polyexplore_gym.sim.pose import PoseModel
-from polyexplore_gym.sim.world import World
+from polyexplore_gym.sim.world import DriveResult, World
 from polyexplore_gym.snapshot import Snapshot
 
 WINDOW_FPS = 10.0
 """The window shows at most so many pictures a second."""
 WINDOW_STEP = 0.5
 """Way between two pictures of a drive in the window, m."""
+_SCAN_TURN = 0.5 * math.pi
+"""Scans on the way are also taken after so much turning (rad) or half the field of view, if that is less."""
+_ON_THE_WAY = ("settled", "interval", "blocked")
+"""Ends of a drive at a scan on the way: none is made in addition."""
 
 
 class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
@@ -41,7 +45,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     A plan seen whole from the start terminates in the first step, whatever the action, at no cost.
 
     Version history: v0, the first. v1: openings instead of chains, a look counts only where it could have shown
-    something, paths through tight doorways, lengths from robot and sensor, swept contact; `info["outcome"]`.
+    something, paths through tight doorways, lengths from robot and sensor, swept contact; `info["outcome"]`. v2: scans on
+    the way are taken in motion, and the next node may be chosen there (`ExplorationConfig.decide`); the observation has
+    `node_pursued`, `info["ended"]` says why a drive ended.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # type: ignore[misc]
@@ -134,6 +140,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._trajectory = [self._world.pose[None]]
         self._measured_at: list[np.ndarray] = []
         self._felt: float | None = None
+        self._target, self._ended, self._parts = -1, "start", 0
         self._path = self._pose_model.estimate[None, :2]
         self._look_around(c.exploration.look_around)
         if not c.exploration.look_around and not self._exploration.reachable.any():
@@ -162,7 +169,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             self._go(int(self._observed.rows[node]))
             self._observe()
         else:
-            self._path = self._pose_model.estimate[None, :2]
+            self._path, self._ended = self._pose_model.estimate[None, :2], "invalid"
         terminated = not self._observed.arrays["action_mask"].any()
         outcome = StepOutcome(
             distance=self._distance - before[0],
@@ -232,54 +239,104 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         heading = self._world.pose[2]
         for i in range(turns):
             if i:
-                self._drive(self._world.pose[None, :2], heading + i * 2.0 * math.pi / turns)
-            self._measure(self._world.pose, None, arrived=True)
+                self._turn(heading + i * 2.0 * math.pi / turns)
+            self._measure()
         self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
 
     def _go(self, row: int) -> None:
-        """Drive to a node, measure there (and on the way, if so configured), and plan anew."""
+        """Drive to a node and measure there, on the way too if so configured; and plan anew."""
         exploration = self._exploration
-        target = int(exploration.chains.id[row])
-        heading = float(exploration.chains.node[row, 2])
-        self._path = exploration.path_to(row)
-        true_path = self._pose_model.to_true(self._path)
-        turn = self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2]
-        assert self._world is not None
-        true_path[0] = self._world.pose[:2]
-        arrived = self._drive(true_path, turn)
+        target, heading = int(exploration.chains.id[row]), float(exploration.chains.node[row, 2])
+        self._target, self._path = target, exploration.path_to(row)
+        self._parts = len(self._trajectory)
+        self._ended = self._approach(target, self._path, heading)
         if self._felt is not None:
             estimate = self._pose_model.estimate
             exploration.bump(estimate, self._felt + estimate[2])
-        if not arrived:
-            # A bump ends the drive, but the robot can still look where it wanted to.
-            self._drive(self._world.pose[None, :2], turn)
-        self._measure(self._world.pose, target, arrived=arrived)
-        came = self._pose_model.to_estimated(self._trajectory[-1 if arrived else -2][:, :2])
-        exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive, came)
+        if self._ended not in _ON_THE_WAY:
+            arrived = self._ended == "arrived"
+            if not arrived:
+                # A bump ends the drive, but the robot can still look where it wanted to.
+                self._turn(self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2])
+            self._measure(target, arrived=arrived)
+        elif self._ended == "blocked":
+            exploration.attempted(target)
+        self._update()
 
-    def _drive(self, path: np.ndarray, heading: float) -> bool:
-        """Drive; scans on the way are taken without stopping. Whether the end was reached."""
+    def _approach(self, target: int, path: np.ndarray, heading: float) -> str:
+        """Drive along a path (k, 2) to the node of a jump edge; scans on the way are taken without slowing down.
+
+        Returns why the drive ended: that of `DriveResult.ended`, or `_ON_THE_WAY`.
+        """
+        exploration, c = self._exploration, self.config.exploration
+        start = self._distance
+        while True:
+            ended, path = self._drive(path, heading)
+            if ended != "cut":
+                return ended
+            self._measure()
+            if c.decide == "arrival":
+                continue
+            if target not in exploration.chains.id:
+                return "settled"
+            if c.decide == "interval" and self._distance - start >= c.decide_every - 1e-9:
+                return "interval"
+            if exploration.blocked(path, self._lines.segments, self._lines.alive):
+                self._update()
+                row = np.flatnonzero(exploration.chains.id == target)
+                if not len(row) or not exploration.reachable[row[0]]:
+                    return "blocked"
+                path, heading = exploration.path_to(int(row[0])), float(exploration.chains.node[row[0], 2])
+
+    def _drive(self, path: np.ndarray, heading: float) -> tuple[str, np.ndarray]:
+        """Drive along a path (k, 2), then turn to a heading, until it is time for a scan on the way.
+
+        Returns why the drive ended, and what is left of the path. Both frames are those of the estimate.
+        """
         assert self._world is not None
-        result = self._world.drive(path, heading)
-        way, stops = _with_stops(result.trajectory, self.config.exploration.scan_every)
-        done = 0
-        for stop in stops:
-            self._follow(way[done : stop + 1])
-            self._measure(way[stop], None, arrived=True)
-            done = stop
-        self._follow(way[done:])
-        self._trajectory.append(way)
+        every = self.config.exploration.scan_every
+        distance = turn = math.inf
+        if every > 0.0:
+            if not self.config.sensor.full_circle:
+                turn = min(_SCAN_TURN, 0.5 * self.config.sensor.field_of_view)
+            if np.hypot(*np.diff(path, axis=0).T).sum() > 1.5 * every:  # else the scan at the end will do
+                distance = every
+        true_path = self._pose_model.to_true(path)
+        true_path[0] = self._world.pose[:2]
+        true_heading = self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2]
+        result = self._take(self._world.drive(true_path, true_heading, distance=distance, turn=turn))
+        rest = path[result.next_vertex :]
+        return result.ended, np.concatenate((self._pose_model.estimate[None, :2], rest))
+
+    def _turn(self, heading: float) -> None:
+        """Turn on the spot to a true heading."""
+        assert self._world is not None
+        self._take(self._world.drive(self._world.pose[None, :2], heading))
+
+    def _take(self, result: DriveResult) -> DriveResult:
+        """Take over what a drive did."""
+        self._follow(result.trajectory)
+        self._trajectory.append(result.trajectory)
         self._distance += result.distance
         self._sim_time += result.duration
         self._collisions += int(result.collided)
         self._felt = result.contact
-        return result.arrived
+        return result
+
+    def _update(self) -> None:
+        """Bring nodes and paths up to date; the way of this decision leads back."""
+        assert self._world is not None
+        to_estimated = self._pose_model.to_estimated
+        came = to_estimated(np.concatenate((*self._trajectory[self._parts :], self._world.pose[None]))[:, :2])
+        self._parts = len(self._trajectory)
+        halt = to_estimated(self._world.halt[None])[0]
+        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive, came, halt)
 
     def _follow(self, way: np.ndarray) -> None:
         """Advance the estimated pose along true poses (m, 3); in the mode slam it is corrected on the way."""
         done = 0
         if self._localizer is not None:
-            way, stops = _with_stops(way, self.config.pose.correct_every, turns=True)
+            way, stops = _with_stops(way, self.config.pose.correct_every)
             for stop in stops:
                 self._pose_model.moved(way[done : stop + 1])
                 self._scan_lines(way[stop])
@@ -299,9 +356,10 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._pose_model.correct(fix.pose, fix.covariance)
         return ranges, found, fix
 
-    def _measure(self, pose: np.ndarray, target: int | None, *, arrived: bool) -> None:
-        """Scan from a true pose and take the scan into both maps."""
+    def _measure(self, target: int | None = None, *, arrived: bool = True) -> None:
+        """Scan from where the robot is and take the scan into both maps."""
         assert self._world is not None
+        pose = self._world.pose
         ranges, found, fix = self._scan_lines(pose)
         scan = Scan(self._world.laser.angles, ranges, fix.pose, fix.covariance, self.config.sensor.full_circle)
         touched = self._lines.insert(found, fix.pose, fix.relative)
@@ -330,6 +388,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             self._pose_model.covariance,
             self.config.sensor.max_range,
             self.config.observation,
+            self._target,
         )
 
     def _observation(self) -> dict[str, np.ndarray]:
@@ -356,6 +415,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             "path": tuple(map(tuple, self._path.tolist())),
             "rewards": rewards(outcome, self.config.reward),
             "invalid_action": invalid,
+            "ended": self._ended,
             "outcome": self._outcome(truncated),
             "cut": {"nodes": self._observed.cut_nodes, "lines": self._observed.cut_lines},
         }
@@ -435,16 +495,15 @@ def _suite(name: str) -> Suite:
     return suite_named(name)
 
 
-def _with_stops(way: np.ndarray, every: float, *, turns: bool = False) -> tuple[np.ndarray, list[int]]:
+def _with_stops(way: np.ndarray, every: float) -> tuple[np.ndarray, list[int]]:
     """A trajectory (m, 3) with a pose at every so many metres put in, and the rows of those; none near the end.
 
-    With `turns` a radian turned counts as a metre.
+    A radian turned counts as a metre.
     """
     run = np.hypot(*np.diff(way[:, :2], axis=0).T)
-    if turns:
-        run += np.abs(np.remainder(np.diff(way[:, 2]) + math.pi, 2.0 * math.pi) - math.pi)
+    run += np.abs(np.remainder(np.diff(way[:, 2]) + math.pi, 2.0 * math.pi) - math.pi)
     driven = np.concatenate(([0.0], np.cumsum(run)))
-    marks = np.arange(every, driven[-1] - 0.5 * every, every) if every > 0 else np.zeros(0)
+    marks = np.arange(every, driven[-1] - 0.5 * every, every)
     if not len(marks):
         return way, []
     nxt = np.searchsorted(driven, marks)

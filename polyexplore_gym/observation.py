@@ -48,6 +48,7 @@ def space(config: ObservationConfig) -> spaces.Dict:
         "node_gain": box(0.0, LIMIT, n),
         "node_kind": box(0.0, 2.0, n),
         "node_visits": box(0.0, LIMIT, n),
+        "node_pursued": mask(n),
         "node_mask": mask(n),
         "action_mask": mask(n),
         "path_lengths": box(0.0, LIMIT, n, n),
@@ -75,8 +76,12 @@ def observe(
     covariance: np.ndarray,
     max_range: float,
     config: ObservationConfig,
+    target: int = -1,
 ) -> Observed:
-    """Observe the state of the maps from the estimated `pose` (3,) with `covariance` (3, 3)."""
+    """Observe the state of the maps from the estimated `pose` (3,) with `covariance` (3, 3).
+
+    `target` is the id of the jump edge that the robot was driving to.
+    """
     n, m = config.max_nodes, config.max_lines
     c = exploration.chains
     rows = np.arange(c.size)
@@ -89,6 +94,7 @@ def observe(
     arrays["pose_covariance"][:] = np.clip(covariance, -_VARIANCE, _VARIANCE)
     arrays["max_range"][:] = max_range
     arrays["node_mask"][:k] = 1
+    arrays["node_pursued"][:k] = c.id[rows] == target
     _nodes(
         rows, c.ends, c.node, c.path_length, c.length, c.gain, c.kind, c.visits, frame, arrays["edges"],
         arrays["node_position"], arrays["node_heading"], arrays["node_path_length"], arrays["node_edge_length"],

@@ -333,7 +333,8 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     `dirty` (m,) marks rows that changed; `left` are pieces in the order of the local rows they come from, with that
     row in place of the owner. A piece that is settled or was visited `max_visits` half times in vain is in no chain;
     openings narrower than `tol.trifle` are forgotten.
-    Returns the new pieces (those of a chain together and in order), and the new chains, numbered from `next_id` on.
+    Returns the new pieces (those of a chain together and in order), the new chains, numbered from `next_id` on, and for
+    each of them the id (c,) of the chain of which it is what is left, or -1.
     """
     m = pieces.kind.size
     away = np.ones(m, np.bool_)
@@ -346,9 +347,11 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     )  # fmt: skip
     stale = np.ones(n, np.bool_)
     lost = np.zeros(next_id + 1, np.bool_)
+    size_before = np.zeros(next_id + 1)
     for i in range(m):
         if dirty[i] and pieces.owner[i] >= 0:
             lost[pieces.owner[i]] = True
+        size_before[pieces.owner[i]] += _size(pieces.segments[i])  # the last stands for pieces without a chain
     at = 0
     k = 0
     for i in range(m):  # in the old order: the pieces of a chain stay in theirs
@@ -369,6 +372,7 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         p.segments[at] = fresh.segments[k]
         p.kind[at], p.sigma[at] = fresh.kind[k], fresh.sigma[k]
         at += 1
+    owner_before = p.owner.copy()
     for i in range(n):
         if p.owner[i] >= 0 and lost[p.owner[i]]:
             stale[i] = True
@@ -383,12 +387,14 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
     keep = np.ones(n, np.bool_)
     for i in range(n):
-        size = math.hypot(p.segments[i, 2] - p.segments[i, 0], p.segments[i, 3] - p.segments[i, 1])
-        keep[i] = not p.settled[i] or size >= tol.trifle
+        keep[i] = not p.settled[i] or _size(p.segments[i]) >= tol.trifle
+    left_of = np.full(new.id.size, -1, np.int64)
     for q in range(new.id.size):
-        for e in range(offsets[q], offsets[q + 1]):
-            p.owner[rows[order[e]]] = new.id[q]
-            keep[rows[order[e]]] = new.width[q] >= tol.trifle
+        members = rows[order[offsets[q] : offsets[q + 1]]]
+        left_of[q] = _most_of(p.segments, owner_before, members, size_before)
+        for i in members:
+            p.owner[i] = new.id[q]
+            keep[i] = new.width[q] >= tol.trifle
     arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
     arranged = arranged[keep[arranged]]
     return (
@@ -397,7 +403,31 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
             p.retried[arranged], p.owner[arranged],
         ),
         new,
+        left_of,
     )  # fmt: skip
+
+
+@njit(cache=True)
+def _size(segment):
+    return math.hypot(segment[2] - segment[0], segment[3] - segment[1])
+
+
+@njit(cache=True)
+def _most_of(segments, owner, members, size_before):
+    """The owner that most of the members (k,) had, if they are also most of what it had (o,); else -1."""
+    total = 0.0
+    for i in members:
+        total += _size(segments[i])
+    for i in members:
+        if owner[i] < 0:
+            continue
+        share = 0.0
+        for j in members:
+            if owner[j] == owner[i]:
+                share += _size(segments[j])
+        if 2.0 * share > total:
+            return owner[i] if 2.0 * share > size_before[owner[i]] else -1
+    return -1
 
 
 @njit(cache=True)

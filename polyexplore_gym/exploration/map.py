@@ -17,6 +17,7 @@ from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
 from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.exploration.scan_polygon import Scans
+from polyexplore_gym.exploration.segments import segment_distance
 from polyexplore_gym.exploration.tolerances import squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
@@ -51,6 +52,24 @@ def _near(segments, alive, x, y, reach):
             rows[count] = i
             count += 1
     return rows[:count].copy()
+
+
+@njit(cache=True)
+def _too_near(path, walls, least):
+    """Whether a wall (m, 4) comes nearer to a path (k, 2) than `least`."""
+    for i in range(path.shape[0] - 1):
+        x1, y1 = path[i]
+        x2, y2 = path[i + 1]
+        for w in walls:
+            if (
+                max(w[0], w[2]) > min(x1, x2) - least
+                and min(w[0], w[2]) < max(x1, x2) + least
+                and max(w[1], w[3]) > min(y1, y2) - least
+                and min(w[1], w[3]) < max(y1, y2) + least
+                and segment_distance(x1, y1, x2, y2, w[0], w[1], w[2], w[3]) < least
+            ):
+                return True
+    return False
 
 
 def _length(segments: np.ndarray) -> float:
@@ -180,6 +199,7 @@ class ExplorationMap:
         self._felt: list[tuple[float, float, float, float, float]] = []
         self._felt_again = False
         self._stuck = 0
+        self._halt = np.zeros(2)
         self._walls = np.zeros((0, 4))
         self._box = _no_box()
 
@@ -261,6 +281,14 @@ class ExplorationMap:
         if target is not None:
             self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
+    def attempted(self, target: int) -> None:
+        """Count an attempt to get to a jump edge that no path led to in the end."""
+        p, c = self.pieces, self.chains
+        mine = p.owner == target
+        p.visits[mine] += 1
+        if mine.any():
+            c.visits[c.id == target] = -(-p.visits[mine].max() // VISIT)
+
     def _measured(self, target: int, x: float, y: float) -> bool:
         """Whether a scan from (x, y) measures a jump edge; a look from afar or from the side is an attempt only."""
         row = np.flatnonzero(self.chains.id == target)
@@ -303,7 +331,7 @@ class ExplorationMap:
         self, pieces: Pieces, dirty: np.ndarray, local: np.ndarray, left: Pieces, fresh: Pieces, walls: np.ndarray
     ) -> None:
         """Put what is left of the local pieces and the fresh ones in their place; make new chains where needed."""
-        done, opened = jump_edges.rechain(
+        done, opened, left_of = jump_edges.rechain(
             pieces, dirty, local, left, fresh, walls, VISIT * self.config.max_visits, self._next_id, self.tol
         )
         self.pieces, new = Pieces(*done), Opened(*opened)
@@ -321,6 +349,10 @@ class ExplorationMap:
                 owner[owner == new.id[q]] = c.id[row]
                 c.visits[row], c.kind[row] = -(-new.visits[q] // VISIT), new.kind[q]
                 staying[row] = True
+        for q in wide[again < 0]:  # what is left of a jump edge is still that one, at another node
+            if left_of[q] >= 0:
+                owner[owner == new.id[q]] = left_of[q]
+                new.id[q] = left_of[q]
         self._drop_vertices(c.vertex[~staying])
         self.chains = c.take(np.flatnonzero(staying)).join(JumpEdges.new(new, wide[again < 0]))
 
@@ -365,13 +397,22 @@ class ExplorationMap:
 
     # Nodes and paths -------------------------------------------------------------------------
 
-    def plan(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray, came: np.ndarray | None = None) -> None:
+    def plan(
+        self,
+        pose: np.ndarray,
+        walls: np.ndarray,
+        alive: np.ndarray,
+        came: np.ndarray | None = None,
+        halt: np.ndarray | None = None,
+    ) -> None:
         """Bring nodes, gains and shortest paths up to date for a robot at the estimated `pose` (3,).
 
-        `came` (k, 2) is the way that it came, the way back out of a tight place.
+        `came` (k, 2) is the way that it came, the way back out of a tight place. `halt` (2,) is where a robot that
+        moves can come to rest at the earliest: paths lead there first.
         """
         if came is not None:
             self._trail.append(came)
+        self._halt = pose[:2] if halt is None else halt
         self._walls = walls[alive]
         touched = np.unique(np.concatenate(self._touched)) if self._touched else np.zeros(0, np.int64)
         self._switch(self._wide)
@@ -441,7 +482,10 @@ class ExplorationMap:
             g.add_way_point(x, y)
         if self.robot >= 0:
             g.remove_leaves(np.array([self.robot]))
-        self._start = self._way_out(x, y)
+        at = float(self._halt[0]), float(self._halt[1])
+        self._start = self._way_out(*at)
+        if at != (x, y):
+            self._start.insert(0, (x, y))
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
         c = self.chains
         reach = self.tol.max_range
@@ -563,6 +607,13 @@ class ExplorationMap:
         """Way points (k, 2) of the shortest path from the robot to node i."""
         way = self.graph.path(self.robot, int(self.chains.vertex[i]))[::-1]
         return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), way))
+
+    def blocked(self, path: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> bool:
+        """Whether walls that came since the last `plan` leave the disc no room on a path (k, 2)."""
+        if not self._touched:
+            return False
+        rows = np.concatenate(self._touched)
+        return bool(_too_near(path, walls[rows[alive[rows]]], self.tol.radius))
 
     def path_lengths(self, rows: np.ndarray) -> np.ndarray:
         """Path lengths (k, k) between the nodes `rows`, m; inf where there is no path."""
