@@ -330,13 +330,16 @@ def advance(distance, initial, allowed, time, speed, acceleration):  # type: ign
             return min(distance, time * (initial - 0.5 * acceleration * time)), time, 0.0, TIME
         return (allowed, spent, now, CUT) if allowed < distance else (distance, spent, 0.0, ARRIVED)
     whole, began = distance + before, initial / acceleration
-    covered = min(distance, max(0.0, profile_distance(time + began, whole, speed, acceleration) - before))
+    total = profile_time(whole, speed, acceleration)
+    covered = distance
+    if time + began < total:
+        covered = min(distance, max(0.0, profile_distance(time + began, whole, speed, acceleration) - before))
     if allowed < covered:
         spent, now = profile_moment(allowed + before, whole, speed, acceleration)
         return allowed, max(0.0, spent - began), now, CUT
     if covered < distance:
         return covered, time, 0.0, TIME
-    return distance, max(0.0, profile_time(whole, speed, acceleration) - began), 0.0, ARRIVED
+    return distance, max(0.0, total - began), 0.0, ARRIVED
 
 
 @njit(cache=True)
