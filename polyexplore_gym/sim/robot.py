@@ -381,10 +381,10 @@ def glide(segments, pose, motion, path, heading, final_turn, radius, limits, tim
         if not last or final_turn:
             turn = ((heading if last else math.atan2(dy, dx)) - phi + math.pi) % (2.0 * math.pi) - math.pi
         if now > 0.0:
-            ahead = not last and abs(turn) < 0.5 * math.pi
-            if length <= _ROUNDING * radius or (ahead and length * abs(math.sin(turn)) <= _ROUNDING * radius):
+            aside = length * abs(math.sin(turn)) if abs(turn) < 0.5 * math.pi else length
+            if not last and aside <= _ROUNDING * radius:
                 turn = 0.0
-            elif ahead and abs(turn) <= _STRAIGHT_ON:
+            elif not last and abs(turn) <= _STRAIGHT_ON:
                 phi, turn_left, turn = phi + turn, turn_left - abs(turn), 0.0  # on the way
             else:
                 time, now = time + now / acceleration, 0.0
