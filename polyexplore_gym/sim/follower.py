@@ -3,7 +3,8 @@
 Pure pursuit with a look-ahead that shrinks with the speed. Sharp corners are driven to, turned at on
 the spot, and left; gentle ones are passed at a speed low enough that the cut stays near 6 % of the
 radius: planned paths leave but little more to the walls. All ramps are braking parabolas in discrete
-time, so that the robot comes to rest where it should without overshoot.
+time, so that the robot comes to rest where it should without overshoot. A robot that moves already follows a path
+that leads on from where it is going at once; from any other it first brakes straight ahead.
 
 Lengths follow from the robot: robot, path and walls made larger together give the same drive, larger.
 Those in radii were tuned on a robot of 0.25 m.
@@ -21,9 +22,9 @@ from polyexplore_gym.sim.robot import SKIN, is_free, nearest_wall
 X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, MET = range(9)
 """The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
 motion lost to a wall (m, see `forget`), and whether (0, 1) a wall has taken anything."""
-FOLLOW, ALIGN, FINAL, DONE, LOST, BUMP = range(6)
-"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading; then the drive has ended:
-arrived, off the path, held by a wall."""
+FOLLOW, ALIGN, FINAL, BRAKE, DONE, LOST, BUMP = range(7)
+"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading, or brake to rest straight
+ahead; then the drive has ended: arrived, off the path, held by a wall."""
 
 _CUT = 0.048
 """How much of a gentle corner may be cut, radii."""
@@ -48,6 +49,8 @@ _LAST_LEG = 2.0
 _AIM, _TURN_BACK = 0.12, 0.08
 """Nearer to the end of a leg (radii) the bearing of that end says little: the robot aligns with the leg instead, and
 does not stop to turn any more."""
+_OVERSHOOT = 1.0
+"""A robot that moves does not take up a path whose first stop it would overshoot by more than this, radii."""
 _BUMP = 0.08
 """A drive ends when a wall has taken this much of the commanded motion, radii (2 cm at 0.25 m)."""
 _STALL = 0.04
@@ -109,6 +112,36 @@ def _braking(left, final, acceleration, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def stopping_distance(speed, limits, step):  # type: ignore[no-untyped-def]
+    """Shortest way (m) to rest from a speed: the inverse of how `command` brakes for a stop. step s; 0: continuous."""
+    if step == 0.0:
+        return speed * speed / (2.0 * limits[2])
+    return max(speed * speed / (2.0 * _MARGIN * limits[2]) + 0.5 * speed * step, speed * step)
+
+
+@njit(cache=True)
+def entry(state, path, speeds, limits, radius):  # type: ignore[no-untyped-def]
+    """The phase in which a path begins. At rest the robot turns towards it first.
+
+    One that moves follows it at once if it leads on within 45 degrees and does not stop before the robot can; else it
+    brakes straight ahead, for if it turned at speed it would swing out. Arguments as in `command`.
+    """
+    speed = state[SPEED]
+    if path.shape[0] == 1:
+        return FINAL if speed == 0.0 else BRAKE
+    if speed == 0.0:
+        return ALIGN
+    course = math.atan2(path[1, 1] - path[0, 1], path[1, 0] - path[0, 0])
+    stop = 0.0
+    for k in range(1, path.shape[0]):
+        stop += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+        if speeds[k] <= 0.0:
+            break
+    late = speed * speed / (2.0 * limits[2]) > stop + _OVERSHOOT * radius
+    return BRAKE if late or abs(_wrap(course - state[HEADING])) > _SHARP else FOLLOW
+
+
+@njit(cache=True)
 def _towards(value, target, change):  # type: ignore[no-untyped-def]
     return min(max(target, value - change), value + change)
 
@@ -151,6 +184,12 @@ def command(state, path, speeds, heading, final_turn, limits, body, step):  # ty
     max_speed, max_rate, acceleration, turn_acceleration = limits
     x, y, phi = state[X], state[Y], state[HEADING]
     last_leg = path.shape[0] - 2
+    if state[PHASE] == BRAKE:
+        if state[SPEED] == 0.0 and state[RATE] == 0.0:
+            state[PHASE] = DONE
+        state[SPEED] = _towards(state[SPEED], 0.0, acceleration * step)
+        state[RATE] = _towards(state[RATE], 0.0, turn_acceleration * step)
+        return
     for _ in range(2 * path.shape[0] + 4):
         if state[PHASE] == FINAL:
             error = _wrap(heading - phi) if final_turn else 0.0
@@ -238,13 +277,14 @@ def feel(state, x, y, acceleration, step, radius):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, walls, box, trajectory):  # type: ignore[no-untyped-def]
+def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, left, walls, box, trajectory):  # type: ignore[no-untyped-def]
     """Follow the path for at most so many steps, as long as no wall takes anything of the motion.
 
-    That is what a physics engine without contacts integrates. body: radius and track (m). walls (W, 4): all those that
-    meet the box (x, y min, x, y max). Fills trajectory (n, 3) with the pose after every step. Returns (steps done,
-    contact). With contact True the command for the next step is set but not executed: a wall takes some of it. Else it
-    ends when the phase is `DONE` or later, when the trajectory is full, and before a step that might leave the box.
+    That is what a physics engine without contacts integrates. body: radius and track (m). left (2,): way (m) and turn
+    (rad) that may still be made, counted down. walls (W, 4): all those that meet the box (x, y min, x, y max). Fills
+    trajectory (n, 3) with the pose after every step. Returns (steps done, contact). With contact True the command for
+    the next step is set but not executed: a wall takes some of it. Else it ends when the phase is `DONE` or later, when
+    either of left is used up, when the trajectory is full, and before a step that might leave the box.
     """
     radius = body[0]
     clear = 0.0  # at least so far to the nearest wall
@@ -268,4 +308,8 @@ def follow(state, path, speeds, heading, final_turn, limits, body, step, steps, 
         state[HEADING] = _wrap(state[HEADING] + state[RATE] * step)
         forget(state, moved)
         trajectory[done, 0], trajectory[done, 1], trajectory[done, 2] = state[X], state[Y], state[HEADING]
+        left[0] -= moved
+        left[1] -= abs(state[RATE]) * step
+        if left[0] <= 0.0 or left[1] <= 0.0:
+            return done + 1, False
     return min(steps, trajectory.shape[0]), False

@@ -21,6 +21,12 @@ SKIN = 1e-7
 far it touches."""
 _ARC = 0.05
 """Round the end of a wall a disc slides in pieces of this length, in radii; it strays outwards by half its square."""
+_STRAIGHT_ON = 0.02
+"""A robot that glides at speed takes up a leg that turns by no more than this (rad) without braking."""
+_ROUNDING = 1e-9
+"""A leg whose end lies no farther than this (radii) from the straight line ahead needs no turn."""
+ARRIVED, CUT, BUMP, TIME, LOST = range(5)
+"""Why a drive ended."""
 _PARALLEL = 1e-10
 """Sine of the angle to a wall below which a motion is along it: rounding, for walls up to 10 km from the origin."""
 
@@ -51,6 +57,29 @@ def walls_near(segments, x_min, y_min, x_max, y_max):  # type: ignore[no-untyped
         x1, y1, x2, y2 = segments[k]
         if max(x1, x2) >= x_min and min(x1, x2) <= x_max and max(y1, y2) >= y_min and min(y1, y2) <= y_max:
             out[n] = k
+            n += 1
+    return out[:n]
+
+
+@njit(cache=True)
+def walls_around(segments, path, pose, margin):  # type: ignore[no-untyped-def]
+    """A box (x, y min, x, y max) around a path (k, 2) and a pose, margin m, and the walls (W, 4) that meet the box."""
+    x_min = x_max = pose[0]
+    y_min = y_max = pose[1]
+    for k in range(path.shape[0]):
+        x_min, x_max = min(x_min, path[k, 0]), max(x_max, path[k, 0])
+        y_min, y_max = min(y_min, path[k, 1]), max(y_max, path[k, 1])
+    box = (x_min - margin, y_min - margin, x_max + margin, y_max + margin)
+    return box, segments[walls_near(segments, *box)]
+
+
+@njit(cache=True)
+def apart(path, shortest):  # type: ignore[no-untyped-def]
+    """Indices of the points of a path (k, 2) that are no nearer than this (m) to the one before that is kept."""
+    out, n = np.zeros(path.shape[0], np.int64), 1
+    for i in range(1, path.shape[0]):
+        if math.hypot(path[i, 0] - path[out[n - 1], 0], path[i, 1] - path[out[n - 1], 1]) >= shortest:
+            out[n] = i
             n += 1
     return out[:n]
 
@@ -272,49 +301,118 @@ def profile_distance(time, distance, speed, acceleration):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def glide(segments, pose, path, heading, final_turn, radius, limits, time_limit):  # type: ignore[no-untyped-def]
-    """Follow path (k, 2) exactly, turning on the spot at its vertices; stop at the first contact or at the time limit.
+def profile_moment(covered, distance, speed, acceleration):  # type: ignore[no-untyped-def]
+    """When so much of the distance is covered on the same profile, and the speed then: (time, speed)."""
+    top = min(speed, math.sqrt(distance * acceleration))
+    ramp = 0.5 * top * top / acceleration
+    if covered <= ramp:
+        now = min(top, math.sqrt(2.0 * acceleration * covered))
+        return now / acceleration, now
+    if covered < distance - ramp:
+        return top / acceleration + (covered - ramp) / top, top
+    now = min(top, math.sqrt(2.0 * acceleration * max(distance - covered, 0.0)))
+    return profile_time(distance, speed, acceleration) - now / acceleration, now
 
-    limits: speed, turn rate, acceleration, turn acceleration. Returns the trajectory (m, 3), the distance, the
-    time, whether a wall stopped it, and whether it arrived.
+
+@njit(cache=True)
+def advance(distance, initial, allowed, time, speed, acceleration):  # type: ignore[no-untyped-def]
+    """Cover a distance from an initial speed to rest, as far as a distance allowed and a time let it.
+
+    That is the end of a profile from rest to rest. Where the distance is too short to brake, the rest of the braking
+    takes its time on the spot at the end. Returns (covered, time, speed then, ended): ended is `ARRIVED`, `CUT` or
+    `TIME`.
+    """
+    before = 0.5 * initial * initial / acceleration  # way and time of that profile that lie behind
+    if before > distance:
+        now = math.sqrt(max(initial * initial - 2.0 * acceleration * min(allowed, distance), 0.0))
+        spent = initial / acceleration if allowed >= distance else (initial - now) / acceleration
+        if spent > time:
+            return min(distance, time * (initial - 0.5 * acceleration * time)), time, 0.0, TIME
+        return (allowed, spent, now, CUT) if allowed < distance else (distance, spent, 0.0, ARRIVED)
+    whole, began = distance + before, initial / acceleration
+    covered = min(distance, max(0.0, profile_distance(time + began, whole, speed, acceleration) - before))
+    if allowed < covered:
+        spent, now = profile_moment(allowed + before, whole, speed, acceleration)
+        return allowed, max(0.0, spent - began), now, CUT
+    if covered < distance:
+        return covered, time, 0.0, TIME
+    return distance, max(0.0, profile_time(whole, speed, acceleration) - began), 0.0, ARRIVED
+
+
+@njit(cache=True)
+def glide(segments, pose, motion, path, heading, final_turn, radius, limits, time_limit, left):  # type: ignore[no-untyped-def]
+    """Follow path (k, 2) exactly, turning on the spot at its vertices.
+
+    motion: initial speed and turn rate, one of them 0. A leg straight ahead is driven on at that speed, a turn to the
+    same side goes on at that rate; else coming to rest first takes its time, but no way: the mode is idealised.
+    limits: speed, turn rate, acceleration, turn acceleration. left: way (m) and turn (rad) after which it is cut short.
+    Returns (trajectory (m, 3), distance, time, ended, next vertex, speed, turn rate); ended is `ARRIVED`, `CUT`, `BUMP`
+    (at the first contact) or `TIME`.
     """
     speed, rate, acceleration, turn_acceleration = limits
+    now, turning = motion
+    way_left, turn_left = left
     out, n = np.empty((2 * path.shape[0] + 2, 3)), 1
     out[0] = pose
-    distance, time, collided = 0.0, 0.0, False
+    distance, time = 0.0, 0.0
     legs = path.shape[0] - 1
     for k in range(legs + 1):
         x, y, phi = out[n - 1]
         last = k == legs
-        if last and not final_turn:
-            break
         dx, dy = (0.0, 0.0) if last else (path[k + 1, 0] - x, path[k + 1, 1] - y)
         length = math.hypot(dx, dy)
         if not last and length == 0.0:
             continue
-        turn = ((heading if last else math.atan2(dy, dx)) - phi + math.pi) % (2.0 * math.pi) - math.pi
+        turn = 0.0
+        if not last or final_turn:
+            turn = ((heading if last else math.atan2(dy, dx)) - phi + math.pi) % (2.0 * math.pi) - math.pi
+        if now > 0.0:
+            ahead = not last and abs(turn) < 0.5 * math.pi
+            if length <= _ROUNDING * radius or (ahead and length * abs(math.sin(turn)) <= _ROUNDING * radius):
+                turn = 0.0
+            elif ahead and abs(turn) <= _STRAIGHT_ON:
+                phi, turn_left, turn = phi + turn, turn_left - abs(turn), 0.0  # on the way
+            else:
+                time, now = time + now / acceleration, 0.0
+        if turning * turn <= 0.0 and turning != 0.0:
+            time, turning = time + abs(turning) / turn_acceleration, 0.0
+        if time > time_limit:
+            return out[:n], distance, time_limit, TIME, k + 1, 0.0, 0.0
         if turn != 0.0:
-            left = time_limit - time
-            turned = profile_distance(left, abs(turn), rate, turn_acceleration)
-            out[n] = x, y, phi + math.copysign(turned, turn)
+            turned, spent, turning, ended = advance(
+                abs(turn),
+                abs(turning),
+                turn_left if way_left > 0.0 else 0.0,
+                time_limit - time,
+                rate,
+                turn_acceleration,
+            )
+            turn_left -= turned
+            phi += math.copysign(turned, turn)
+            out[n] = x, y, phi
             n += 1
-            if turned < abs(turn):
-                return out[:n], distance, time_limit, collided, False
-            time += profile_time(abs(turn), rate, turn_acceleration)
+            if ended == TIME:
+                return out[:n], distance, time_limit, TIME, k + 1, 0.0, 0.0
+            time += spent
+            if ended == CUT:
+                return out[:n], distance, time, CUT, k + 1, 0.0, math.copysign(turning, turn)
         if last:
             break
         contact, stop = first_contact(segments, x, y, dx, dy, radius, STANDOFF * radius)
         if contact <= 1.0:
-            collided = True
             dx, dy, length = dx * stop, dy * stop, length * stop
-        driven = profile_distance(time_limit - time, length, speed, acceleration)
+        allowed = way_left if turn_left > 0.0 else 0.0
+        driven, spent, now, ended = advance(length, now, allowed, time_limit - time, speed, acceleration)
+        way_left -= driven
         share = driven / length if length > 0.0 else 0.0
         distance += driven
-        out[n] = x + dx * share, y + dy * share, out[n - 1, 2]
+        out[n] = x + dx * share, y + dy * share, phi
         n += 1
-        if driven < length:
-            return out[:n], distance, time_limit, False, False
-        time += profile_time(length, speed, acceleration)
-        if collided:
-            return out[:n], distance, time, True, False
-    return out[:n], distance, time, False, True
+        if ended == TIME:
+            return out[:n], distance, time_limit, TIME, k + 1, 0.0, 0.0
+        time += spent
+        if ended == CUT:
+            return out[:n], distance, time, CUT, k + 1, now, 0.0
+        if contact <= 1.0:
+            return out[:n], distance, time, BUMP, k + 1, 0.0, 0.0
+    return out[:n], distance, time, ARRIVED, legs + 1, 0.0, 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +14,18 @@ from polyexplore_gym.sim import follower
 from polyexplore_gym.sim.engine import Engine
 from polyexplore_gym.sim.laser import Laser
 from polyexplore_gym.sim.pose import wrap
-from polyexplore_gym.sim.robot import glide, nearest_wall, walls_near, way_length
+from polyexplore_gym.sim.robot import (
+    ARRIVED,
+    BUMP,
+    CUT,
+    LOST,
+    TIME,
+    apart,
+    glide,
+    nearest_wall,
+    walls_around,
+    way_length,
+)
 
 _PATH_START = 0.004
 """A path starts no farther from the robot than this, radii."""
@@ -24,9 +36,16 @@ _MARGIN = 3.0
 gets farther off, those around it are looked up anew."""
 _ARRIVED = 0.2
 """A drive that ends farther than this (radii) from the end of its path has not arrived."""
+_SAME, _SAME_COURSE = 0.2, 0.1
+"""A drive carries on with the one that was cut short if the next vertex lies no farther than this from where it was:
+radii, and share of the leg to it."""
 _PENETRATION = 8e-5
 """The disc may start so deep in a wall, radii: what is left where poses were rounded."""
 _ROWS = 2048
+
+
+Ended = Literal["arrived", "cut", "bump", "time", "lost"]
+_ENDED: dict[int, Ended] = {ARRIVED: "arrived", CUT: "cut", BUMP: "bump", TIME: "time", LOST: "lost"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +59,50 @@ class DriveResult:
     """Way travelled by the centre of the body, m."""
     duration: float
     """Simulated time, s."""
-    collided: bool
-    """Whether a wall ended the drive."""
+    ended: Ended
+    """`arrived`: the end of the path and the heading were reached; `cut`: the way or the turn asked for was driven, and
+    the robot moves on; `bump`: a wall ended it; `time`: the time limit; `lost`: the robot could not keep to the path,
+    as one that covers many of its lengths in a step."""
+    next_vertex: int
+    """Index in the path given of the next vertex that the robot had not passed; the length of the path where none was
+    left: it carries on along [its position, *path[next_vertex:]]."""
     contact: float | None
     """Where on the rim a bump was felt: bearing in the robot frame, rad; None without a bump."""
-    arrived: bool
-    """Whether the end of the path and the heading were reached; False after a bump, at the time limit, or where a
-    robot that covers many of its lengths in a step could not keep to the path."""
+
+    @property
+    def arrived(self) -> bool:
+        return self.ended == "arrived"
+
+    @property
+    def collided(self) -> bool:
+        return self.ended == "bump"
+
+
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """The motion of a drive that was cut short: what the next one carries on with."""
+
+    state: np.ndarray
+    """As in `sim.follower`; in `kinematic` pose, speed and turn rate only."""
+    behind: np.ndarray
+    """(2,) m, where the leg began, or the end of the path where none is left."""
+    ahead: np.ndarray | None
+    """(2,) m, the next vertex, if any."""
+    time: float
+    """Driven so far, s: the time limit holds for all the pieces of a drive together."""
+
+    @classmethod
+    def of(cls, state: np.ndarray, path: np.ndarray, vertex: int, time: float) -> _Cut:
+        """From the path (k, 2) driven and the index in it of the next vertex."""
+        return cls(state, path[min(vertex, len(path)) - 1], path[vertex] if vertex < len(path) else None, time)
+
+    def goes_on(self, path: np.ndarray, radius: float) -> bool:
+        """Whether a path (k, 2) leads on to the same next vertex."""
+        if self.ahead is None or len(path) == 1:
+            return self.ahead is None and len(path) == 1
+        leg = math.hypot(self.ahead[0] - self.behind[0], self.ahead[1] - self.behind[1])
+        off = math.hypot(path[1, 0] - self.ahead[0], path[1, 1] - self.ahead[1])
+        return off <= min(_SAME * radius, _SAME_COURSE * leg)
 
 
 class World:
@@ -60,6 +116,14 @@ class World:
 
     In `kinematic` mode the robot follows the path exactly, turns on the spot at its vertices and halts 0.4 % of the
     radius before the first wall that its disc would touch.
+
+    A drive may be cut short: the robot then moves on at the speed it has, and the next drive begins with that. If its
+    path leads to the same next vertex, it is the same drive: it goes on along the same leg, as if it had not been cut
+    (in `physics` to the last bit while no wall is touched), and the time limit holds for all its pieces together. On
+    another path it is a new drive; of the old one it keeps the motion, and what walls have taken of it: cutting hides
+    no bump. Where a new path does not lead on, a robot in `physics` first brakes straight ahead and takes it up from
+    there, so it should lead through `halt`; a `kinematic` robot halts at once, and only the time counts that it would
+    take to brake.
     """
 
     def __init__(
@@ -91,6 +155,7 @@ class World:
         self.laser = Laser(sensor)
         self._walls = walls
         self._pose = start
+        self._cut: _Cut | None = None
         self._limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
 
     @property
@@ -103,36 +168,76 @@ class World:
         """(M, 4) walls, read-only."""
         return self._walls
 
+    @property
+    def velocity(self) -> tuple[float, float]:
+        """Speed (m/s) and turn rate (rad/s) at which the robot moves: zero but after a drive that was cut short."""
+        if self._cut is None:
+            return 0.0, 0.0
+        return float(self._cut.state[follower.SPEED]), float(self._cut.state[follower.RATE])
+
+    @property
+    def halt(self) -> np.ndarray:
+        """(2,) the place straight ahead where the robot can come to rest at the earliest, m; where it stands at rest.
+
+        A new path that leads there first is taken up without a swing, whatever its next leg.
+        """
+        step = self.config.time_step if self.config.mode == "physics" else 0.0
+        way = follower.stopping_distance(self.velocity[0], self._limits, step)
+        x, y, heading = self._pose.tolist()
+        return np.array([x + way * math.cos(heading), y + way * math.sin(heading)])
+
     def measure(self, rng: np.random.Generator) -> np.ndarray:
         """One noisy scan from the true pose: ranges (n,) m, inf for no return."""
         return self.laser.measure(self._walls, self._pose, rng)
 
-    def drive(self, path: np.ndarray, heading: float | None = None) -> DriveResult:
+    def stop(self) -> DriveResult:
+        """Brake to rest straight ahead. It has arrived where it stands then; a wall may end it sooner."""
+        path = self._pose[None, :2]
+        if self.config.mode == "kinematic" and self.velocity[0] > 0.0:
+            path = np.vstack([path, self.halt])
+        return self.drive(path)
+
+    def drive(
+        self,
+        path: np.ndarray,
+        heading: float | None = None,
+        *,
+        distance: float = math.inf,
+        turn: float = math.inf,
+    ) -> DriveResult:
         """Drive along path (k, 2), k >= 1, true frame, from the robot's position; then turn to heading (rad), if any.
 
+        After so much way (distance, m) or so much turning to and fro (turn, rad), whichever comes first, it returns
+        with the robot moving on (`physics`: after the time step in which that is reached). A path of one point stops
+        a robot that moves.
+
         Raises `InvalidMotionError` for an array that is not finite (k, 2), a path that starts more than 0.4 % of the
-        radius from the robot, or a heading that is not finite.
+        radius from the robot, a heading that is not finite, or a distance or turn that is not positive.
         """
-        way = self._checked_path(path)
+        points = self._checked_path(path)
         final_turn = heading is not None
         goal = 0.0 if heading is None else float(heading)
         if not math.isfinite(goal):
             raise InvalidMotionError(f"heading {heading!r}: expected a finite number")
-        if self.config.mode == "kinematic":
-            return self._glide(way, goal, final_turn)
-        return self._follow(way, goal, final_turn)
+        if not (distance > 0.0 and turn > 0.0):
+            raise InvalidMotionError(f"distance {distance!r}, turn {turn!r}: expected positive numbers")
+        drive = self._glide if self.config.mode == "kinematic" else self._follow
+        return drive(points, goal, final_turn, float(distance), float(turn))
 
     def _checked_path(self, path: np.ndarray) -> np.ndarray:
-        way = np.array(path, dtype=np.float64, order="C")
-        if way.ndim != 2 or way.shape[1] != 2 or len(way) == 0 or not np.isfinite(way).all():
-            raise InvalidMotionError(f"path of shape {way.shape}: expected finite (k, 2), k >= 1")
-        if math.hypot(way[0, 0] - self._pose[0], way[0, 1] - self._pose[1]) > _PATH_START * self.robot.radius:
-            raise InvalidMotionError(f"path starts at {way[0].tolist()}, the robot stands at {self._pose[:2].tolist()}")
-        keep = [0]
-        for i in range(1, len(way)):
-            if math.hypot(*(way[i] - way[keep[-1]])) >= _SHORTEST_LEG * self.robot.radius:
-                keep.append(i)
-        return way if len(keep) == len(way) else np.ascontiguousarray(way[keep])
+        points = np.array(path, dtype=np.float64, order="C")
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
+            raise InvalidMotionError(f"path of shape {points.shape}: expected finite (k, 2), k >= 1")
+        if math.hypot(points[0, 0] - self._pose[0], points[0, 1] - self._pose[1]) > _PATH_START * self.robot.radius:
+            raise InvalidMotionError(
+                f"path starts at {points[0].tolist()}, the robot stands at {self._pose[:2].tolist()}"
+            )
+        return points
+
+    def _legs(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The path without legs that are too short, and the indices of its vertices in the one given."""
+        keep = apart(points, _SHORTEST_LEG * self.robot.radius)
+        return points if len(keep) == len(points) else points[keep], keep
 
     def _contact(self, collided: bool) -> float | None:
         """What a ring of bumpers feels: the bearing of the nearest wall in the robot frame."""
@@ -141,65 +246,147 @@ class World:
         _, px, py = nearest_wall(self._walls, self._pose[0], self._pose[1])
         return wrap(math.atan2(py - self._pose[1], px - self._pose[0]) - self._pose[2])
 
-    def _glide(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
-        trajectory, distance, duration, collided, arrived = glide(
+    def _carried_on(self, points: np.ndarray) -> _Cut | None:
+        """The drive that a path carries on, if any; the path then begins where the leg began."""
+        cut = self._cut
+        if cut is None or not cut.goes_on(points, self.robot.radius):
+            return None
+        points[0] = cut.behind
+        return cut
+
+    def _glide(self, points: np.ndarray, heading: float, final_turn: bool, way: float, turn: float) -> DriveResult:
+        drive = self._carried_on(points)
+        before = drive.time if drive else 0.0
+        path, keep = self._legs(points)
+        trajectory, distance, duration, ended, vertex, speed, rate = glide(
             self._walls,
             self._pose,
+            self.velocity,
             path,
             heading,
             final_turn,
             self.robot.radius,
             self._limits,
-            self.config.time_limit,
+            max(0.0, self.config.time_limit - before),
+            (way, turn),
         )
-        trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
-        self._pose = trajectory[-1].copy()
-        return DriveResult(
-            trajectory, float(distance), float(duration), bool(collided), self._contact(collided), bool(arrived)
-        )
+        following = int(keep[vertex]) if vertex < len(keep) else len(points)
+        cut = None
+        if ended == CUT:
+            cut = _Cut.of(np.array([*trajectory[-1], speed, rate]), path, vertex, before + duration)
+        return self._end(trajectory, distance, duration, ended, following, cut)
 
-    def _follow(self, path: np.ndarray, heading: float, final_turn: bool) -> DriveResult:
-        robot, step = self.robot, self.config.time_step
+    def _follow(self, points: np.ndarray, heading: float, final_turn: bool, way: float, turn: float) -> DriveResult:
+        robot, step, limits = self.robot, self.config.time_step, self._limits
+        drive = self._carried_on(points)
+        before = round(drive.time / step) if drive else 0
+        path, keep = self._legs(points)
+        speeds = follower.vertex_speeds(path, limits, robot.radius, step)
         state = np.zeros(9)
         state[:3] = self._pose
-        state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
-        speeds = follower.vertex_speeds(path, self._limits, robot.radius, step)
-        steps = max(1, math.ceil(self.config.time_limit / step))
-        body, rows = (robot.radius, robot.track), np.empty((_ROWS, 3))
-        engine: Engine | None = None  # no longer than the drive, so that none depends on the contacts of an earlier one
-        parts, done, contact = [self._pose[None]], 0, False
-        while done < steps and state[follower.PHASE] < follower.DONE:
-            if not contact:
-                box, walls = self._around(path, state)
-            count, contact = follower.follow(
-                state, path, speeds, heading, final_turn, self._limits, body, step, steps - done, walls, box, rows
-            )
-            parts.append(rows[:count].copy())
-            done += count
-            if contact:
-                engine = engine or Engine(robot, self._walls)
-                before = float(state[follower.HEADING])
-                part = np.array([(*point, before) for point in engine.step(state, step)])
-                follower.feel(state, part[-1, 0], part[-1, 1], robot.max_acceleration, step, robot.radius)
-                part[-1, 2] = state[follower.HEADING]
-                parts.append(part)
-                done += 1
-        trajectory = np.concatenate(parts)
-        trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
-        self._pose = trajectory[-1].copy()
-        ended = state[follower.PHASE] >= follower.DONE and state[follower.MET] > 0.0
-        away = math.hypot(self._pose[0] - path[-1, 0], self._pose[1] - path[-1, 1]) > _ARRIVED * robot.radius
-        arrived = bool(state[follower.PHASE] == follower.DONE) and not away
-        collided = bool(ended and not arrived)
-        return DriveResult(
-            trajectory, float(way_length(trajectory)), done * step, collided, self._contact(collided), arrived
-        )
+        if self._cut is not None:
+            state[:] = self._cut.state
+            state[follower.LEG] = 0.0
+        if drive is None:
+            state[follower.PHASE] = follower.entry(state, path, speeds, limits, robot.radius)
+            state[follower.MET] = state[follower.DEFICIT] > 0.0
+        steps = max(1, math.ceil(self.config.time_limit / step)) - before
+        run = _Run(robot, self._walls, step, limits, state, steps, np.array([way, turn]))
+        if state[follower.PHASE] == follower.BRAKE:
+            run.along(points[:1], speeds, 0.0, False)
+            if state[follower.PHASE] == follower.DONE:
+                points[0] = state[:2]
+                path, keep = self._legs(points)
+                speeds = follower.vertex_speeds(path, limits, robot.radius, step)
+                state[follower.PHASE] = follower.entry(state, path, speeds, limits, robot.radius)
+        run.along(path, speeds, heading, final_turn)
+        trajectory, ended = np.concatenate(run.parts), run.ended(path[-1])
+        vertex = int(state[follower.LEG]) + 1
+        following = int(keep[vertex]) if vertex < len(keep) else len(points)
+        cut = _Cut.of(state, path, vertex, (before + run.done) * step) if ended == CUT else None
+        return self._end(trajectory, way_length(trajectory), run.done * step, ended, following, cut)
 
-    def _around(self, path: np.ndarray, state: np.ndarray) -> tuple[tuple[float, ...], np.ndarray]:
-        """A box (x, y min, x, y max) around the path and the robot, and the walls that meet it."""
-        robot = self.robot
-        margin = (1.0 + _MARGIN) * robot.radius + robot.max_speed * self.config.time_step
-        low = np.minimum(path.min(axis=0), state[:2]) - margin
-        high = np.maximum(path.max(axis=0), state[:2]) + margin
-        box = (*low.tolist(), *high.tolist())
-        return box, self._walls[walls_near(self._walls, *box)]
+    def _end(
+        self, trajectory: np.ndarray, distance: float, duration: float, ended: int, following: int, cut: _Cut | None
+    ) -> DriveResult:
+        trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
+        self._pose, self._cut = trajectory[-1].copy(), cut
+        contact = self._contact(ended == BUMP)
+        return DriveResult(trajectory, float(distance), float(duration), _ENDED[ended], following, contact)
+
+
+class _Run:
+    """The time steps of a drive in `physics`."""
+
+    def __init__(
+        self,
+        robot: RobotConfig,
+        walls: np.ndarray,
+        step: float,
+        limits: tuple[float, float, float, float],
+        state: np.ndarray,
+        steps: int,
+        left: np.ndarray,
+    ) -> None:
+        """state (9,) and left (2,) as in `follower.follow`, changed as it drives; steps: at most so many."""
+        self.robot, self.walls, self.step, self.limits = robot, walls, step, limits
+        self.state, self.steps, self.left = state, steps, left
+        self.parts, self.done = [state[None, :3].copy()], 0
+        self.engine: Engine | None = None
+        """No longer than the drive or its piece: none depends on the contacts of an earlier one, and a copy of a world
+        goes on as the original."""
+
+    @property
+    def over(self) -> bool:
+        return self.done >= self.steps or self.state[follower.PHASE] >= follower.DONE or self.left.min() <= 0.0
+
+    def along(self, path: np.ndarray, speeds: np.ndarray, heading: float, final_turn: bool) -> None:
+        """Drive on until it is over."""
+        robot, state, step = self.robot, self.state, self.step
+        body, rows, contact = (robot.radius, robot.track), np.empty((_ROWS, 3)), False
+        margin = (1.0 + _MARGIN) * robot.radius + robot.max_speed * step
+        while not self.over:
+            if not contact:
+                box, walls = walls_around(self.walls, path, state, margin)
+            count, contact = follower.follow(
+                state,
+                path,
+                speeds,
+                heading,
+                final_turn,
+                self.limits,
+                body,
+                step,
+                self.steps - self.done,
+                self.left,
+                walls,
+                box,
+                rows,
+            )
+            self.parts.append(rows[:count].copy())
+            self.done += count
+            if contact:
+                self._touch()
+
+    def _touch(self) -> None:
+        """A time step of which walls take something."""
+        state = self.state
+        self.engine = self.engine or Engine(self.robot, self.walls)
+        before = float(state[follower.HEADING])
+        part = np.array([(*point, before) for point in self.engine.step(state, self.step)])
+        self.left[0] -= way_length(np.vstack([state[None, :3], part]))
+        self.left[1] -= abs(state[follower.RATE]) * self.step
+        follower.feel(state, part[-1, 0], part[-1, 1], self.limits[2], self.step, self.robot.radius)
+        part[-1, 2] = state[follower.HEADING]
+        self.parts.append(part)
+        self.done += 1
+
+    def ended(self, end: np.ndarray) -> int:
+        """Why it is over; end (2,) of the path, m."""
+        state = self.state
+        away = math.hypot(state[follower.X] - end[0], state[follower.Y] - end[1]) > _ARRIVED * self.robot.radius
+        if state[follower.PHASE] == follower.DONE and not away:
+            return ARRIVED
+        if state[follower.PHASE] >= follower.DONE:
+            return BUMP if state[follower.MET] > 0.0 else LOST
+        return CUT if self.left.min() <= 0.0 else TIME

@@ -118,6 +118,7 @@ def test_ends_before_it_leaves_the_box_of_known_walls() -> None:
             (robot.radius, robot.track),
             step,
             10_000 - done,
+            np.full(2, np.inf),
             walls,
             (-3.0, -3.0, edge, 3.0),
             part,
