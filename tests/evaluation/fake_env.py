@@ -86,6 +86,7 @@ class FakeEnv(gymnasium.Env):
             "sim_time": 2.0 * self.distance,
             "collisions": 0,
             "invalid_action": self.bad,
+            "ended": "arrived" if self.steps else "start",
             "outcome": {
                 "status": status,
                 "unreached": left,
