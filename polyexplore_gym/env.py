@@ -45,9 +45,9 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     A plan seen whole from the start terminates in the first step, whatever the action, at no cost.
 
     Version history: v0, the first. v1: openings instead of chains, a look counts only where it could have shown
-    something, paths through tight doorways, lengths from robot and sensor, swept contact; `info["outcome"]`. v2: scans on
-    the way are taken in motion, and the next node may be chosen there (`ExplorationConfig.decide`); the observation has
-    `node_pursued`, `info["ended"]` says why a drive ended.
+    something, paths through tight doorways, lengths from robot and sensor, swept contact; `info["outcome"]`. v2: scans
+    on the way are taken in motion, and the next node may be chosen there (`ExplorationConfig.decide`); the observation
+    has `node_pursued`, `info["ended"]` says why a drive ended.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 4}  # type: ignore[misc]
