@@ -251,7 +251,7 @@ def _figures(records: Sequence[EpisodeRecord], summary: Summary) -> list[dict[st
     for c in (c for c in summary.against_reference if c.pairs):
         sets.setdefault(f"{c.ours[1]}: against {summary.reference}", []).append(c)
     for c in (c for c in summary.between_settings if c.pairs):
-        sets.setdefault(f"{c.ours[1]}: against {c.theirs[1]}, with the same policy", []).append(c)
+        sets.setdefault(f"{c.ours[1]}: against {c.theirs[1]}", []).append(c)
     if sets:
         ratios, shorter = [], []
         for name, found in sets.items():
