@@ -44,6 +44,7 @@ FOLDER_SUFFIXES = (".json", ".geojson", ".yaml", ".yml", ".dxf")
 """What is taken for a plan in a folder; .svg is not, since pictures are."""
 
 Placement = Literal["midpoint", "in_front"]
+Sensing = Literal["stops", "passing", "moving"]
 Drive = Literal["physics", "kinematic"]
 
 
@@ -64,6 +65,9 @@ class Bench:
     """Names of baselines, with parameters as in utility:rate=0.1, or module:attribute for an own policy."""
     placements: tuple[Placement, ...] = ("midpoint", "in_front")
     """Where nodes are placed."""
+    sensing: tuple[Sensing, ...] = ("stops", "moving")
+    """When the robot measures and decides: at nodes, where it stops; also measures in passing, but decides at nodes; or
+    both on the way. Scans on the way lie 0.5 m apart unless the configuration names another exploration.scan_every."""
     seeds: int = 1
     """Starts (and streams of noise) on each plan."""
     workers: int = 0
@@ -103,6 +107,8 @@ class Run:
     """Start: x and y in m, heading in degrees; drawn from the seed if left out."""
     placement: Placement | None = None
     """Where nodes are placed, instead of what the configuration says."""
+    sensing: Sensing | None = None
+    """When the robot measures and decides (see bench), instead of what the configuration says."""
     drive: Drive | None = None
     """How the robot drives, instead of what the configuration says."""
     preset: PresetName | None = None
@@ -189,6 +195,8 @@ class Eval:
     """Only the first so many plans, of each suite."""
     against: tuple[str, ...] = ("nearest",)
     """Policies to compare with; the first is the reference."""
+    sensing: tuple[Sensing, ...] = ("stops",)
+    """When the robot measures and decides: see bench."""
     seeds: int = 1
     """Starts (and streams of noise) on each plan."""
     workers: int = 0
@@ -290,7 +298,7 @@ def evaluate_model(options: Eval) -> int:
             "--against: names of policies, of which none is 'learned': so the model is called here"
         )
     policies["learned"] = make_policy("learned", model=options.model)
-    same = ("suite", "plans", "first", "seeds", "workers", "out", "drive", "preset", "config", "plots")
+    same = ("suite", "plans", "first", "sensing", "seeds", "workers", "out", "drive", "preset", "config", "plots")
     fields = {name: getattr(options, name) for name in same}
     return _compare(Bench(placements=("in_front",), reference=options.against[0], **fields), policies)
 
@@ -309,11 +317,12 @@ def _compare(options: Bench, policies: dict[str, PolicySpec]) -> int:
         policies=policies,
         plans=list(_bench_plans(options, config)),
         placements=options.placements,
+        sensing=options.sensing,
         seeds=range(options.seeds),
         config=config,
     )
-    total = len(study.policies) * len(study.placements) * len(study.plans) * len(study.seeds)
-    _say(f"{len(study.plans)} plans x {len(study.seeds)} starts x {len(study.placements)} placements x "
+    total = len(study.policies) * len(study.settings) * len(study.plans) * len(study.seeds)
+    _say(f"{len(study.plans)} plans x {len(study.seeds)} starts x {len(study.settings)} settings x "
          f"{len(study.policies)} policies = {total} episodes -> {options.out}")  # fmt: skip
     workers = options.workers or os.cpu_count() or 1
     bounds = {}
@@ -361,7 +370,7 @@ def run(options: Run) -> int:
     from polyexplore_gym.evaluation.runner import make_env
 
     _check_run(options)
-    config = _config(options.config, options.preset, options.drive, options.placement)
+    config = _config(options.config, options.preset, options.drive, options.placement, options.sensing)
     plan = _plan(options.plan, config.robot.radius, options.start, options.reading)
     policy = load_policy(options.policy)
     env = make_env(config)
@@ -507,7 +516,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 130
 
 
-def _config(path: Path | None, preset: str | None, drive: str | None, placement: str | None = None) -> EnvConfig:
+def _config(
+    path: Path | None,
+    preset: str | None,
+    drive: str | None,
+    placement: str | None = None,
+    sensing: str | None = None,
+) -> EnvConfig:
     values: Any = {}
     if path is not None:
         try:
@@ -519,9 +534,12 @@ def _config(path: Path | None, preset: str | None, drive: str | None, placement:
     config = from_mapping(EnvConfig, values, path=str(path or "config"))
     if drive is not None:
         config = replace(config, drive=replace(config.drive, mode=drive))  # type: ignore[arg-type]
-    if placement is not None:
-        config = replace(config, exploration=replace(config.exploration, placement=placement))  # type: ignore[arg-type]
-    return config
+    if placement is None and sensing is None:
+        return config
+    from polyexplore_gym.evaluation import Setting
+
+    setting = Setting.of(config)
+    return Setting(placement or setting.placement, sensing or setting.sensing).configured(config)
 
 
 def _plan(name: str, radius: float, start: Sequence[float] | None, reading: PlanFileConfig) -> FloorPlan:
@@ -598,12 +616,14 @@ def _bench_plots(study: Study, records: list[EpisodeRecord], summary: Summary, o
     # One plan of middle size, seen with every policy.
     plan = sorted(study.plans, key=lambda p: p.area)[len(study.plans) // 2]
     seed = study.seeds[0]
-    for placement in study.placements:
-        ran = {r.policy for r in records if (r.plan_hash, r.seed) == (plan.content_hash, seed) and r.status != "failed"}
+    for setting in study.settings:
+        pair = plan.content_hash, seed
+        ran = {r.policy for r in records if (r.setting, r.pair) == (setting, pair) and r.status != "failed"}
         policies = {label: spec for label, spec in study.policies.items() if label in ran}
         if policies:
-            figure = plots.trajectory_figure(policies, plan, seed, study.config_for(placement))
-            written.append(plots.save(figure, options.out / f"trajectories-{placement}.png"))
+            figure = plots.trajectory_figure(policies, plan, seed, setting.configured(study.config))
+            name = f"trajectories-{setting}.png".replace(", ", "-")
+            written.append(plots.save(figure, options.out / name))
     return written
 
 
@@ -661,8 +681,9 @@ def _run_text(record: EpisodeRecord, plan: FloorPlan) -> str:
     told = [f"{n} jump edges ({length:.1f} m) {what}" for what, n, length in left if n]
     status = ", ".join([record.status if record.error is None else f"failed: {record.error}", *told])
     return (
-        f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.placement}, {record.drive}: {status}\n"
+        f"{record.plan} ({plan.area:.0f} m2), {record.policy}, {record.setting}, {record.drive}: {status}\n"
         f"  distance      {record.distance:.1f} m in {record.decisions} decisions, {record.sim_time:.0f} s simulated\n"
+        f"  drives        {', '.join(f'{count} {end}' for end, count in record.ends.items()) or 'none'}\n"
         f"  seen          {100 * record.coverage:.1f} % ({', '.join(reached)})\n"
         f"  measurements  {record.measurements}\n"
         f"  collisions    {record.collisions}"

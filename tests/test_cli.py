@@ -65,20 +65,22 @@ def test_a_folder_is_compared(folder, tmp_path, capsys):
     assert any(line.startswith("left out:") and "half.json" in line for line in lines)
     assert any(line.startswith("left out:") and "zz_again.json: the same geometry as" in line for line in lines)
     assert "README" not in captured.err
-    assert "2 plans x 2 starts x 2 placements x 2 policies = 16 episodes" in captured.err
+    assert "2 plans x 2 starts x 4 settings x 2 policies = 32 episodes" in captured.err
     records = read_records(out)
-    assert len(records) == 16
+    assert len(records) == 32
     assert all(r.ended for r in records)
     assert {r.drive for r in records} == {"kinematic"}
     assert {r.plan for r in records} == {"rooms", "small"}
     assert {p["name"] for p in read_manifest(out)["study"]["plans"]} == {"rooms", "small"}
     assert min(r.coverage for r in records) > 0.97
-    for name in ("coverage.png", "ratios.png", "trajectories-midpoint.png", "trajectories-in_front.png"):
-        assert (out / name).stat().st_size > 5000
+    ways = [f"trajectories-{placement}{end}" for placement in ("midpoint", "in_front") for end in ("", "-moving")]
+    for name in ("coverage", "ratios", *ways):
+        assert (out / f"{name}.png").stat().st_size > 5000
     # What is printed is what the records say.
-    nearest = [r.distance for r in records if (r.policy, r.placement) == ("nearest", "midpoint")]
-    row = next(line.split() for line in captured.out.splitlines() if line.startswith("midpoint   nearest"))
+    nearest = [r.distance for r in records if (r.policy, str(r.setting)) == ("nearest", "midpoint")]
+    row = next(line.split() for line in captured.out.splitlines() if line.split()[:2] == ["midpoint", "nearest"])
     assert float(row[3]) == pytest.approx(np.mean(nearest), abs=0.051)
+    assert "midpoint, moving: compared on 4 of 4 starts" in captured.out
     # The same start for all: coverage is the same before the first decision.
     starts = {(r.plan, r.seed, r.curve_coverage[0]) for r in records}
     assert len(starts) == 4
@@ -170,6 +172,29 @@ def test_what_is_left_is_told(folder, capsys, monkeypatch):
     assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
     told = capsys.readouterr().out.splitlines()[0]
     assert told.endswith("kinematic: unreached, 3 jump edges (2.5 m) out of reach, 1 jump edges (0.8 m) given up")
+
+
+def test_a_robot_that_senses_on_the_way(folder, tmp_path, capsys):
+    command = ["run", str(folder / "rooms.json"), "--drive", "kinematic"]
+    told = {}
+    for sensing in ("stops", "passing", "moving"):
+        assert main([*command, "--sensing", sensing]) == 0
+        told[sensing] = capsys.readouterr().out
+    assert "nearest, midpoint, kinematic: complete" in told["stops"]
+    assert "nearest, midpoint, passing, kinematic: complete" in told["passing"]
+    assert "settled" in told["moving"]
+    assert "settled" not in told["stops"] + told["passing"]
+    scans = [int(text.split("measurements")[1].split()[0]) for text in told.values()]
+    assert scans[0] < min(scans[1:])
+    # What the configuration says is kept, and the command goes before it.
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"exploration": {"scan_every": 0.25, "decide": "interval", "decide_every": 0.25}}))
+    assert main([*command, "--config", str(config)]) == 0
+    often = capsys.readouterr().out
+    assert "nearest, midpoint, moving, kinematic: complete" in often
+    assert "interval" in often
+    assert main([*command, "--config", str(config), "--sensing", "stops"]) == 0
+    assert capsys.readouterr().out == told["stops"]
 
 
 def test_a_robot_by_name(folder, capsys):

@@ -11,6 +11,7 @@ from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.results import read_manifest, read_records
 from polyexplore_gym.evaluation.runner import Study, evaluate, name_policies
+from polyexplore_gym.evaluation.setting import Setting
 from polyexplore_gym.evaluation.summary import Summary, summarize
 from polyexplore_gym.evaluation.tables import summary_text, write_tables
 
@@ -19,6 +20,7 @@ __all__ = [
     "EpisodeRecord",
     "Policy",
     "PolicySpec",
+    "Setting",
     "Study",
     "Summary",
     "evaluate",

@@ -18,12 +18,9 @@ from typing import Any
 
 from polyexplore_gym.config import EnvConfig
 from polyexplore_gym.errors import MissingDependencyError, ResultsError
-from polyexplore_gym.evaluation.records import EpisodeRecord
+from polyexplore_gym.evaluation.records import EpisodeRecord, Pair
 
 BOUNDS = "bounds.json"
-
-Pair = tuple[str, int]
-"""Plan hash and seed: one start on one plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +50,7 @@ RATIOS: dict[str, Callable[[Bounds], float]] = {
 
 def over(record: EpisodeRecord, bounds: Mapping[Pair, Bounds], name: str) -> float | None:
     """The distance over one of the bounds (`RATIOS`); None where there is none, or all is seen from the start."""
-    found = bounds.get((record.plan_hash, record.seed))
+    found = bounds.get(record.pair)
     way = RATIOS[name](found) if found is not None else 0.0
     return record.distance / way if way > 0 else None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from polyexplore_gym.config import EnvConfig
 from polyexplore_gym.evaluation.policy import Policy
 from polyexplore_gym.evaluation.records import THRESHOLDS, EpisodeRecord
+from polyexplore_gym.evaluation.setting import Setting
 
 _POLICY_STREAM = 0x706F6C69637900
 """Keeps the policy's random numbers apart from those of the environment, which has the same seed."""
@@ -21,7 +23,7 @@ Observer = Callable[[gymnasium.Env, Mapping[str, Any], int | None, bool], None]
 
 
 def policy_rng(seed: int, plan_hash: str) -> np.random.Generator:
-    """The generator that a policy gets for an episode: the same for all policies and placements."""
+    """The generator that a policy gets for an episode: the same for all policies and settings."""
     return np.random.default_rng([_POLICY_STREAM, seed, int(plan_hash[:16] or "0", 16)])
 
 
@@ -59,7 +61,7 @@ def run_episode(
     reached = dict(zip(THRESHOLDS, log.distances_to_coverage(), strict=True))
     return EpisodeRecord(
         policy=label,
-        placement=config.exploration.placement,
+        **Setting.of(config)._asdict(),
         plan=str(plan.name),
         plan_hash=plan.content_hash,
         group=building(plan),
@@ -80,6 +82,7 @@ def run_episode(
         curve_distance=tuple(round(d, 4) for d in log.distance),
         curve_coverage=tuple(round(c, 6) for c in log.coverage),
         decisions=len(log.latency),
+        ends=dict(sorted(log.ends.items())),
         measurements=int(log.info.get("measurements", 0)),
         sim_time=round(float(log.info.get("sim_time", 0.0)), 6),
         collisions=int(log.info.get("collisions", 0)),
@@ -124,6 +127,7 @@ def _play(
         log.latency.append(time.perf_counter() - began)
         observation, reward, terminated, truncated, info = env.step(action)
         log.reward += float(reward)
+        log.ends[str(info["ended"])] += 1
         log.add(info)
 
 
@@ -142,6 +146,7 @@ class _Log:
         self.distance: list[float] = []
         self.coverage: list[float] = []
         self.latency: list[float] = []
+        self.ends: Counter[str] = Counter()
         self.invalid_actions = 0
         self.cut = {"nodes": 0, "lines": 0}
         self.reward = 0.0

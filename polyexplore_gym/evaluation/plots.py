@@ -15,6 +15,7 @@ from polyexplore_gym.evaluation.episode import run_episode
 from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
+from polyexplore_gym.evaluation.setting import Setting
 from polyexplore_gym.evaluation.statistics import Interval, coverage_at, mean_band, proportion_band
 from polyexplore_gym.evaluation.summary import Comparison, Summary, finished
 
@@ -36,19 +37,17 @@ def coverage_figure(
 ) -> Figure:
     """Coverage against the distance driven: mean over the starts, with its 95 % interval over buildings.
 
-    Distances are divided by what the reference policy drove on the same plan, start and placement to
+    Distances are divided by what the reference policy drove on the same plan and start and in the same setting to
     the end, so that small and large plans can be averaged. Only starts that all policies
-    finished at a placement are in it (as in `summarize`); one panel a placement. Of many policies only the
+    finished in a setting are in it (as in `summarize`); one panel a setting. Of many policies only the
     reference has its interval.
     """
-    placements = list(dict.fromkeys(r.placement for r in records))
     policies = list(dict.fromkeys(r.policy for r in records))
-    figure = _figure(4.6 * len(placements) + 0.4, 3.9)
     grid = np.linspace(0.0, 1.6, 161)
     done = finished(records)
-    panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
-    for panel, placement in zip(panels, placements, strict=True):
-        found = {(r.policy, r.plan_hash, r.seed): r for r in done if r.placement == placement}
+    figure, panels = _panels(records)
+    for setting, panel in panels.items():
+        found = {(r.policy, *r.pair): r for r in done if r.setting == setting}
         compared = [p for p in policies if any(key[0] == p for key in found)]
         base = reference if reference in compared else next(iter(compared), "")
         pairs = [
@@ -70,29 +69,26 @@ def coverage_figure(
             panel.plot(grid, mean, color=color, linestyle=dash, linewidth=1.6, label=policy)
             if policy in (compared if len(compared) <= BANDS else [base]):
                 panel.fill_between(grid, low.clip(0, 100), high.clip(0, 100), color=color, alpha=0.12, linewidth=0)
-        panel.set_title(f"{placement} ({len(pairs)} starts)", fontsize=10, color=_INK)
+        panel.set_title(f"{setting} ({len(pairs)} starts)", fontsize=10, color=_INK)
         panel.set_xlabel(f"distance / that of {base} until the end" if base else "distance", fontsize=9)
         panel.set_xlim(0.0, grid[-1])
         _plain(panel)
-    panels[0].set_ylabel("area seen, %", fontsize=9)
-    _legend(panels, "lower right")
+    _finish(panels, "area seen, %")
     return figure
 
 
 def profile_figure(records: Sequence[EpisodeRecord], *, reference: str = "nearest") -> Figure:
     """Performance profiles (Dolan and More 2002): how often a policy is how much longer than the best one.
 
-    The share of starts on which its distance is at most so many times the shortest of all policies at that
-    placement, with its 95 % interval. What was not finished is infinitely long. Starts that all policies
-    ran and one finished are in it; one panel a placement. Of many policies only the reference has its interval.
+    The share of starts on which its distance is at most so many times the shortest of all policies in that
+    setting, with its 95 % interval. What was not finished is infinitely long. Starts that all policies
+    ran and one finished are in it; one panel a setting. Of many policies only the reference has its interval.
     """
-    placements = list(dict.fromkeys(r.placement for r in records))
     policies = list(dict.fromkeys(r.policy for r in records))
     done = {r.key for r in finished(records)}
-    figure = _figure(4.6 * len(placements) + 0.4, 3.9)
-    panels = np.atleast_1d(figure.subplots(1, len(placements), sharey=True))
-    for panel, placement in zip(panels, placements, strict=True):
-        found = {(r.policy, r.plan_hash, r.seed): r for r in records if r.placement == placement}
+    figure, panels = _panels(records)
+    for setting, panel in panels.items():
+        found = {(r.policy, *r.pair): r for r in records if r.setting == setting}
         ran = [p for p in policies if any(key[0] == p for key in found)]
         starts = [key[1:] for key in found if key[0] == ran[0] and all((p, *key[1:]) in found for p in ran)]
         runs = np.array([[found[(p, *start)] for p in ran] for start in starts], dtype=object).reshape(-1, len(ran))
@@ -114,26 +110,37 @@ def profile_figure(records: Sequence[EpisodeRecord], *, reference: str = "neares
             panel.set_xscale("log")
             panel.set_xlim(1.0, last)
             _ratio_ticks(panel, 1.0, last)
-        panel.set_title(f"{placement} ({len(runs)} starts)", fontsize=10, color=_INK)
+        panel.set_title(f"{setting} ({len(runs)} starts)", fontsize=10, color=_INK)
         panel.set_xlabel("distance / the shortest on that start, at most", fontsize=9)
         panel.set_ylim(0, 103)
         _plain(panel)
-    panels[0].set_ylabel("starts, %", fontsize=9)
-    _legend(panels, "lower right")
+    _finish(panels, "starts, %")
     return figure
 
 
 def ratio_figure(summary: Summary) -> Figure:
-    """Distance over that of the reference: every start a dot, the geometric mean with its interval above it."""
-    comparisons = [*summary.against_reference, *summary.between_placements]
-    return comparison_figure(comparisons, [_versus(c) for c in comparisons])
+    """Ratios of the distances: every start a dot, the geometric mean with its interval above it.
+
+    To the left policies against the reference in the same setting, to the right settings with the same policy.
+    """
+    sides = [some for some in (summary.against_reference, summary.between_settings) if any(c.pairs for c in some)]
+    most = max((sum(c.pairs > 0 for c in some) for some in sides), default=1)
+    figure = _figure(7.0 * max(len(sides), 1), 1.3 + 0.42 * most)
+    for panel, some in zip(np.atleast_1d(figure.subplots(1, max(len(sides), 1))), sides or [[]], strict=True):
+        _compared(panel, [(c, _versus(c)) for c in some if c.pairs], most)
+    return figure
 
 
 def comparison_figure(comparisons: Sequence[Comparison], labels: Sequence[str], *, width: float = 7.0) -> Figure:
     """As `ratio_figure`, for some comparisons with names of one's own; `width` in inches."""
     rows = [(c, label) for c, label in zip(comparisons, labels, strict=True) if c.pairs]
     figure = _figure(width, 1.3 + 0.42 * max(len(rows), 1))
-    panel = figure.subplots()
+    _compared(figure.subplots(), rows, len(rows))
+    return figure
+
+
+def _compared(panel: Any, rows: Sequence[tuple[Comparison, str]], room: int) -> None:
+    """Ratios with their names, in a panel with room for so many."""
     span = [1.0]
     for row, (c, _) in enumerate(rows):
         ratios = np.array(c.ratios)
@@ -143,14 +150,13 @@ def comparison_figure(comparisons: Sequence[Comparison], labels: Sequence[str], 
         panel.scatter(ratios, row + 0.2 + ripple, s=7, color="#8a8a8a", alpha=0.5, linewidths=0)
         _whisker(panel, c, c.ratio, row - 0.12)
     panel.axvline(1.0, color=_INK, linewidth=0.8, zorder=0)
-    _rows(panel, [label for _, label in rows])
+    _rows(panel, [label for _, label in rows], room)
     panel.set_xscale("log")
     low, high = np.nanmin(span) / 1.05, np.nanmax(span) * 1.05
     panel.set_xlim(low, high)
     _ratio_ticks(panel, low, high)
     panel.set_xlabel("ratio of the distances (below 1: shorter)", fontsize=9)
     _plain(panel)
-    return figure
 
 
 def improvement_figure(comparisons: Sequence[Comparison], labels: Sequence[str], *, width: float = 7.0) -> Figure:
@@ -161,7 +167,7 @@ def improvement_figure(comparisons: Sequence[Comparison], labels: Sequence[str],
     for row, (c, _) in enumerate(rows):
         _whisker(panel, c, c.improvement, row)
     panel.axvline(0.5, color=_INK, linewidth=0.8, zorder=0)
-    _rows(panel, [label for _, label in rows])
+    _rows(panel, [label for _, label in rows], len(rows))
     panel.set_xlim(-0.02, 1.02)
     panel.set_xlabel("probability of the shorter way (above 0.5: better)", fontsize=9)
     _plain(panel)
@@ -258,10 +264,27 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _legend(panels: np.ndarray, place: str) -> None:
-    handles, labels = panels[0].get_legend_handles_labels()
+def _panels(records: Sequence[EpisodeRecord]) -> tuple[Figure, dict[Setting, Any]]:
+    """A figure with a panel a setting, two beside each other."""
+    settings = list(dict.fromkeys(r.setting for r in records))
+    columns = min(len(settings), 2)
+    rows = -(-len(settings) // columns)
+    figure = _figure(4.6 * columns + 0.4, 3.9 * rows)
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for panel in grid[len(settings) :]:
+        panel.remove()
+    return figure, dict(zip(settings, grid, strict=False))
+
+
+def _finish(panels: Mapping[Setting, Any], what: str) -> None:
+    """Name the vertical axes and put the legend into the last panel."""
+    every = list(panels.values())
+    for panel in every:
+        if panel.get_subplotspec().is_first_col():
+            panel.set_ylabel(what, fontsize=9)
+    handles, labels = every[0].get_legend_handles_labels()
     if handles:
-        panels[-1].legend(handles, labels, fontsize=8, frameon=False, loc=place)
+        every[-1].legend(handles, labels, fontsize=8, frameon=False, loc="lower right")
 
 
 def _whisker(panel: Any, c: Comparison, value: Interval, height: float) -> None:
@@ -270,9 +293,9 @@ def _whisker(panel: Any, c: Comparison, value: Interval, height: float) -> None:
     panel.plot([value.estimate], [height], "o", color=color, markersize=5.5)
 
 
-def _rows(panel: Any, labels: Sequence[str]) -> None:
+def _rows(panel: Any, labels: Sequence[str], room: int) -> None:
     panel.set_yticks(range(len(labels)), labels, fontsize=8)
-    panel.set_ylim(len(labels) - 0.4, -0.6)
+    panel.set_ylim(room - 0.4, -0.6)
 
 
 def _ratio_ticks(panel: Any, low: float, high: float) -> None:
@@ -300,8 +323,8 @@ def _style(index: int) -> tuple[str, Any]:
 
 def _versus(c: Comparison) -> str:
     if c.ours[1] == c.theirs[1]:
-        return f"{c.ours[0]} / {c.theirs[0]}, {c.ours[1]}"
-    return f"{c.ours[1]} / {c.theirs[1]}, {c.ours[0]}"
+        return f"{c.ours[0]} / {c.theirs[0]}\n{c.ours[1]}"
+    return f"{c.ours[0]}\n{c.ours[1]} / {c.theirs[1]}"
 
 
 def _shape(plan: Any) -> float:

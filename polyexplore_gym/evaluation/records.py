@@ -9,13 +9,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from polyexplore_gym.evaluation.setting import SENSING, Setting
+
 THRESHOLDS = (90, 95, 99)
 """Percentages of coverage for which the distance is kept."""
 STATUSES = ("complete", "unreached", "truncated", "failed")
 _ACCEPTED: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
 
-Key = tuple[str, str, str, int]
-"""Policy, placement, plan hash, seed: what tells an episode from the others of its study."""
+Key = tuple[str, str, str, str, int]
+"""Policy, placement, sensing, plan hash, seed: what tells an episode from the others of its study."""
+Pair = tuple[str, int]
+"""Plan hash and seed: one start on one plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +30,8 @@ class EpisodeRecord:
     """Name of the policy."""
     placement: str
     """Where nodes were placed: `midpoint` or `in_front`."""
+    sensing: str
+    """When the robot measured and decided: `stops`, `passing` or `moving` (`evaluation.setting.SENSING`)."""
     plan: str
     """Name of the floor plan."""
     plan_hash: str
@@ -67,6 +73,8 @@ class EpisodeRecord:
     """Coverage there, to 1e-6."""
     decisions: int = 0
     """Actions taken."""
+    ends: Mapping[str, int] = field(default_factory=dict, hash=False)
+    """How many of their drives ended for which reason (`info["ended"]`), sorted by name."""
     measurements: int = 0
     """Scans taken."""
     sim_time: float = 0.0
@@ -87,7 +95,17 @@ class EpisodeRecord:
     @property
     def key(self) -> Key:
         """What tells the episode from the others of its study."""
-        return self.policy, self.placement, self.plan_hash, self.seed
+        return self.policy, *self.setting, *self.pair
+
+    @property
+    def setting(self) -> Setting:
+        """Placement and sensing."""
+        return Setting(self.placement, self.sensing)
+
+    @property
+    def pair(self) -> Pair:
+        """The start: what is paired when policies or settings are compared."""
+        return self.plan_hash, self.seed
 
     @property
     def complete(self) -> bool:
@@ -119,8 +137,12 @@ class EpisodeRecord:
             kind = _KINDS.get(str(f.type))
             if kind is not None:
                 values[f.name] = _checked(f.name, values[f.name], *kind)
-        if values["status"] not in STATUSES:
-            raise ValueError(f"status is {values['status']!r}, not one of {', '.join(STATUSES)}")
+        if not isinstance(values["ends"], dict):
+            raise ValueError(f"field 'ends' is {values['ends']!r}, not an object")
+        values["ends"] = {name: _checked("ends", count, int) for name, count in values["ends"].items()}
+        for name, known in (("status", STATUSES), ("sensing", SENSING)):
+            if values[name] not in known:
+                raise ValueError(f"{name} is {values[name]!r}, not one of {', '.join(known)}")
         if len(values["curve_distance"]) != len(values["curve_coverage"]):
             raise ValueError("curve_distance and curve_coverage differ in length")
         if values["status"] in ("complete", "unreached") and not values["curve_distance"]:

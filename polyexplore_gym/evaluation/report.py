@@ -26,6 +26,7 @@ from polyexplore_gym.evaluation.policy import load_policy
 from polyexplore_gym.evaluation.records import EpisodeRecord
 from polyexplore_gym.evaluation.results import EPISODES, MANIFEST, read_manifest, read_plan, read_records
 from polyexplore_gym.evaluation.runner import MakeEnv, make_env
+from polyexplore_gym.evaluation.setting import FIELDS, Setting
 from polyexplore_gym.evaluation.summary import Comparison, Summary, compare, finished, summarize
 from polyexplore_gym.evaluation.tables import interval_text, legend, summary_tables
 
@@ -113,6 +114,7 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
         "bounds": _bounds(study, summary.bounds, plans),
         "figures": _figures(records, summary),
         "breakdown": _breakdown(records, summary.reference, plans),
+        "ends": _ends(records),
         "runs": _runs(records, study, config, plans, summary.reference, runs, make_env),
         "failures": _failures(records),
         **_set_up(manifest, config, records, plans),
@@ -121,6 +123,7 @@ def render_report(folder: Path, *, reference: str = "nearest", runs: int = 3, ma
         "results": "Results",
         "figures": "Figures",
         "breakdown": "By family and size",
+        "ends": "Ends of drives",
         "runs": "Best and worst runs",
         "bounds": "Best possible",
     }
@@ -152,7 +155,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], list[EpisodeRecord], list[str]]
             for name, values in (
                 ("plan", [p["hash"] for p in study["plans"]]),
                 ("seed", study["seeds"]),
-                ("placement", study["placements"]),
+                ("setting", _settings(study)),
                 ("policy", study["policies"]),
             )
         }
@@ -160,7 +163,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], list[EpisodeRecord], list[str]]
             key=lambda r: (
                 place["plan"][r.plan_hash],
                 place["seed"][r.seed],
-                place["placement"][r.placement],
+                place["setting"][r.setting],
                 place["policy"][r.policy],
             )
         )
@@ -169,21 +172,26 @@ def _read(folder: Path) -> tuple[dict[str, Any], list[EpisodeRecord], list[str]]
     return manifest, records, [str(w.message) for w in caught]
 
 
+def _settings(study: Mapping[str, Any]) -> list[Setting]:
+    return [Setting(placement, sensing) for sensing in study["sensing"] for placement in study["placements"]]
+
+
 def _subtitle(study: Mapping[str, Any], config: EnvConfig) -> str:
     seeds = len(study["seeds"])
     view = round(np.degrees(config.sensor.field_of_view))
     return (
-        f"{len(study['policies'])} policies, {' and '.join(study['placements'])} nodes, {len(study['plans'])} floor "
-        f"plans, {seeds} start{'s' * (seeds != 1)} on each; {config.drive.mode} drive, pose {config.pose.mode}, laser "
-        f"of {view:g} degrees and {config.sensor.max_range:g} m"
+        f"{len(study['policies'])} policies, nodes {' and '.join(study['placements'])}, sensing "
+        f"{' and '.join(study['sensing'])}; {len(study['plans'])} floor plans, {seeds} start{'s' * (seeds != 1)} on "
+        f"each; {config.drive.mode} drive, pose {config.pose.mode}, laser of {view:g} degrees and "
+        f"{config.sensor.max_range:g} m"
     )
 
 
 def _missing(study: Mapping[str, Any], records: Sequence[EpisodeRecord]) -> dict[str, Any] | None:
     each = len(study["plans"]) * len(study["seeds"])
-    ran = Counter((r.placement, r.policy) for r in records)
-    sides = list(itertools.product(study["placements"], study["policies"]))
-    rows = [[*side, f"{each - ran[side]} of {each}"] for side in sides if ran[side] < each]
+    ran = Counter((r.setting, r.policy) for r in records)
+    sides = list(itertools.product(_settings(study), study["policies"]))
+    rows = [[*map(str, side), f"{each - ran[side]} of {each}"] for side in sides if ran[side] < each]
     total = each * len(sides)
     return {"count": total - len(records), "total": total, "rows": rows} if len(records) < total else None
 
@@ -213,15 +221,16 @@ def _tiles(
 
 
 def _figures(records: Sequence[EpisodeRecord], summary: Summary) -> list[dict[str, Any]]:
-    placements = list(dict.fromkeys(r.placement for r in records))
-    by_placement = {p: [r for r in records if r.placement == p] for p in placements}
+    by_setting: dict[Setting, list[EpisodeRecord]] = {}
+    for r in records:
+        by_setting.setdefault(r.setting, []).append(r)
     profiles = [
-        _image(plots.profile_figure(some, reference=summary.reference), f"Performance profiles, {placement}")
-        for placement, some in by_placement.items()
+        _image(plots.profile_figure(some, reference=summary.reference), f"Performance profiles, {setting}")
+        for setting, some in by_setting.items()
     ]
     curves = [
-        _image(plots.coverage_figure(some, reference=summary.reference), f"Coverage against distance, {placement}")
-        for placement, some in by_placement.items()
+        _image(plots.coverage_figure(some, reference=summary.reference), f"Coverage against distance, {setting}")
+        for setting, some in by_setting.items()
     ]
     groups = [
         {
@@ -238,15 +247,15 @@ def _figures(records: Sequence[EpisodeRecord], summary: Summary) -> list[dict[st
             "images": curves,
         },
     ]
-    sets = {p: [c for c in summary.against_reference if c.ours[1] == p and c.pairs] for p in placements}
-    names = [(f"{p}, against {summary.reference}", found, [c.ours[0] for c in found]) for p, found in sets.items()]
-    between = [c for c in summary.between_placements if c.pairs]
-    labels = [f"{c.ours[0]}\n{c.ours[1]} / {c.theirs[1]}" for c in between]
-    names += [("placements, with the same policy", between, labels)] if between else []
-    names = [(name, found, some) for name, found, some in names if found]
-    if names:
+    sets: dict[str, list[Comparison]] = {}
+    for c in (c for c in summary.against_reference if c.pairs):
+        sets.setdefault(f"{c.ours[1]}: against {summary.reference}", []).append(c)
+    for c in (c for c in summary.between_settings if c.pairs):
+        sets.setdefault(f"{c.ours[1]}: against {c.theirs[1]}", []).append(c)
+    if sets:
         ratios, shorter = [], []
-        for name, found, some in names:
+        for name, found in sets.items():
+            some = [c.ours[0] for c in found]
             ratios.append(
                 _image(plots.comparison_figure(found, some, width=5.2), f"Ratios of the distances, {name}", name)
             )
@@ -268,7 +277,7 @@ def _band_text(records: Sequence[EpisodeRecord]) -> str:
 def _breakdown(
     records: Sequence[EpisodeRecord], reference: str, plans: Mapping[str, FloorPlan | None]
 ) -> list[dict[str, Any]]:
-    """Tables of the ratios to the reference: rows are families and sizes, columns policies; one a placement."""
+    """Tables of the ratios to the reference: rows are families and sizes, columns policies; one a setting."""
     policies = [p for p in dict.fromkeys(r.policy for r in records) if p != reference]
     if not policies:
         return []
@@ -282,20 +291,36 @@ def _breakdown(
 
     parts |= _parts(records, size, sizes)
     rng = np.random.default_rng(0)
-    rows: dict[str, list[dict[str, Any]]] = {}
+    rows: dict[Setting, list[dict[str, Any]]] = {}
     for name, some in parts.items():
-        found: dict[str, dict[str, Comparison]] = {}
+        found: dict[Setting, dict[str, Comparison]] = {}
         for c in compare(some, rng, reference=reference):
             found.setdefault(c.ours[1], {})[c.ours[0]] = c
-        for placement, row in found.items():
+        for setting, row in found.items():
             cells = [_cell(row.get(policy)) for policy in policies]
             starts = max((c.pairs for c in row.values()), default=0)
-            rows.setdefault(placement, []).append({"name": name, "starts": starts, "cells": cells})
+            rows.setdefault(setting, []).append({"name": name, "starts": starts, "cells": cells})
     return [
-        {"title": placement, "header": ("plans", "starts", *policies), "rows": rows[placement]}
-        for placement in dict.fromkeys(r.placement for r in records)
-        if placement in rows
+        {"title": str(setting), "header": ("plans", "starts", *policies), "rows": rows[setting]}
+        for setting in dict.fromkeys(r.setting for r in records)
+        if setting in rows
     ]
+
+
+def _ends(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
+    """Why drives ended, of each policy in each setting."""
+    ends: dict[tuple[str, str], Counter[str]] = {}
+    for r in records:
+        ends.setdefault((str(r.setting), r.policy), Counter()).update(r.ends)
+    most = Counter[str]()
+    for count in ends.values():
+        most.update(count)
+    names = [name for name, _ in most.most_common()]
+    rows = []
+    for side, count in ends.items():
+        shares = [f"{100 * count[name] / count.total():.2f}" if count[name] else "-" for name in names]
+        rows.append([*side, str(count.total()), *shares])
+    return {"header": ("setting", "policy", "drives", *(f"{name} %" for name in names)), "rows": rows}
 
 
 def _parts(
@@ -331,17 +356,17 @@ def _runs(
     count: int,
     make_env: MakeEnv,
 ) -> dict[str, Any]:
-    """The runs that gained and lost most against the reference on the same start, each beside the reference's."""
+    """The runs that gained and lost most against the reference from the same start in the same setting, beside it."""
     text = (
         f"The runs that were shortest and longest in proportion to the way of {reference} from the same start, each "
         "beside it; no policy and no plan twice. They were run again for the picture, from the ring to "
         "the robot."
     )
-    base = {(r.placement, r.plan_hash, r.seed): r for r in finished(records) if r.policy == reference}
+    base = {(r.setting, *r.pair): r for r in finished(records) if r.policy == reference}
     pairs = [
         (r, base[key])
         for r in finished(records)
-        if r.policy != reference and (key := (r.placement, r.plan_hash, r.seed)) in base and base[key].distance > 0
+        if r.policy != reference and (key := (r.setting, *r.pair)) in base and base[key].distance > 0
     ]
     pairs.sort(key=lambda pair: pair[0].distance / pair[1].distance)
     drawable = [pair for pair in pairs if plans.get(pair[0].plan_hash) is not None]
@@ -369,7 +394,7 @@ def _runs(
                 if not same:
                     notes.append(f"{record.policy} goes another way now than when it was recorded (other versions?).")
             title_ = (
-                f"{ours.policy}, {ours.placement}: {ours.distance / theirs.distance:.2f} times the way of "
+                f"{ours.policy}, {ours.setting}: {ours.distance / theirs.distance:.2f} times the way of "
                 f"{theirs.policy} on {ours.plan}, seed {ours.seed}"
             )
             runs.append({"title": title_, "images": images, "note": " ".join(notes)})
@@ -393,8 +418,7 @@ def _drawn(
     record: EpisodeRecord, plan: Any, study: Mapping[str, Any], config: EnvConfig, make_env: MakeEnv
 ) -> tuple[Image, bool]:
     """An episode that is run again, as a picture, and whether it went as recorded."""
-    exploration = dataclasses.replace(config.exploration, placement=record.placement)  # type: ignore[arg-type]
-    env = make_env(dataclasses.replace(config, exploration=exploration))
+    env = make_env(record.setting.configured(config))
     policy = load_policy(study["policies"][record.policy])
     figure, again = plots.run_figure(env, policy, plan, record.seed, label=record.policy)
     env.close()
@@ -417,7 +441,7 @@ def _failures(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
     rows = [
         [
             r.policy,
-            r.placement,
+            str(r.setting),
             r.plan,
             str(r.seed),
             kind(r),
@@ -437,7 +461,7 @@ def _failures(records: Sequence[EpisodeRecord]) -> dict[str, Any]:
     return {
         "text": text,
         "rows": rows,
-        "header": ("policy", "placement", "plan", "seed", "what", "m", "seen %", "edges left", "error"),
+        "header": ("policy", "setting", "plan", "seed", "what", "m", "seen %", "edges left", "error"),
     }
 
 
@@ -474,7 +498,8 @@ def _set_up(
 ) -> dict[str, Any]:
     study = manifest["study"]
     values, default = dict(_flat(to_mapping(config))), dict(_flat(to_mapping(EnvConfig())))
-    values.pop("exploration.placement")  # that of each row
+    for name in FIELDS:
+        values.pop(f"exploration.{name}")
     fields = [
         [name, f"{value}", "" if value == default[name] else f"{default[name]}"] for name, value in values.items()
     ]
@@ -488,6 +513,11 @@ def _set_up(
         "versions": [[name, str(version)] for name, version in manifest.get("versions", {}).items()],
         "configuration": sorted(fields, key=lambda row: row[2] == ""),
         "changed": sum(row[2] != "" for row in fields),
+        "settings": [
+            [str(setting), *(str(getattr(setting.configured(config).exploration, name)) for name in FIELDS)]
+            for setting in _settings(study)
+        ],
+        "settings_header": ("setting", *FIELDS),
         "policies": [[name, str(spec)] for name, spec in study["policies"].items()],
         "plans": rows,
         "plans_header": ("name", "m²", "family", "building", "hash"),

@@ -25,6 +25,8 @@ from polyexplore_gym.evaluation.records import EpisodeRecord, Key
 if TYPE_CHECKING:
     from polyexplore_gym.floorplan import FloorPlan
 
+FORMAT = 3
+"""Raised when the files' layout changes."""
 MANIFEST = "manifest.json"
 EPISODES = "episodes.jsonl"
 PLANS = "plans"
@@ -86,9 +88,12 @@ def read_records(folder: Path) -> list[EpisodeRecord]:
     A damaged last line (a run that was killed) is left out with a warning.
 
     Raises:
-        ResultsError: there are no results, or another line is damaged; names file and line.
+        ResultsError: there are no results, they are of another version, or another line is damaged (names file and
+            line).
     """
     path = Path(folder) / EPISODES
+    if (Path(folder) / MANIFEST).exists():
+        _check_format(Path(folder), read_manifest(folder))
     try:
         records, _ = _parse(path, path.read_bytes())
     except OSError as error:
@@ -197,15 +202,23 @@ def _keep_plans(folder: Path, plans: Iterable[FloorPlan]) -> None:
             temporary.replace(path)
 
 
+def _check_format(folder: Path, manifest: Mapping[str, Any]) -> None:
+    if manifest.get("format") != FORMAT:
+        raise ResultsError(
+            f"{folder}: holds results in format {manifest.get('format')}, this version reads and writes format "
+            f"{FORMAT}: choose another folder, or delete this one to start anew"
+        )
+
+
 def _check_same(path: Path, manifest: Mapping[str, Any]) -> None:
     found = read_manifest(path.parent)
-    for part in ("format", "study"):
-        different = _difference(found.get(part), manifest[part], part)
-        if different:
-            raise ResultsError(
-                f"{path.parent}: holds the results of another study: {different}; choose another folder, or "
-                "delete this one to start anew"
-            )
+    _check_format(path.parent, found)
+    different = _difference(found.get("study"), manifest["study"], "study")
+    if different:
+        raise ResultsError(
+            f"{path.parent}: holds the results of another study: {different}; choose another folder, or "
+            "delete this one to start anew"
+        )
     ours, theirs = manifest["versions"], found.get("versions", {})
     if ours["polyexplore-gym"] != theirs.get("polyexplore-gym"):
         raise ResultsError(

@@ -1,8 +1,7 @@
-"""Policies x placements x plans x seeds, in parallel, kept on disk and resumed after a stop."""
+"""Policies x settings x plans x seeds, in parallel, kept on disk and resumed after a stop."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib.metadata
 import platform
@@ -22,10 +21,8 @@ from polyexplore_gym.errors import InvalidConfigError, ResultsError
 from polyexplore_gym.evaluation.episode import building, run_episode
 from polyexplore_gym.evaluation.policy import Policy, PolicySpec, load_policy, policy_label
 from polyexplore_gym.evaluation.records import EpisodeRecord, Key
-from polyexplore_gym.evaluation.results import ResultsFile, open_folder
-
-FORMAT = 2
-"""Raised when the files' layout changes."""
+from polyexplore_gym.evaluation.results import FORMAT, ResultsFile, open_folder
+from polyexplore_gym.evaluation.setting import Setting
 
 MakeEnv = Callable[[EnvConfig], gymnasium.Env]
 Backend = Literal["loky", "ray"]
@@ -41,7 +38,7 @@ def make_env(config: EnvConfig) -> gymnasium.Env:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """What is compared on what. All policies and placements meet the same plans, starts and noise."""
+    """What is compared on what. All policies and settings meet the same plans, starts and noise."""
 
     policies: Mapping[str, PolicySpec]
     """Policies by the name under which their results are kept."""
@@ -49,16 +46,19 @@ class Study:
     """`FloorPlan`s, no two of the same geometry."""
     placements: Sequence[str] = ("midpoint",)
     """Node placements, each one a run of its own (`EnvConfig.exploration.placement` is replaced)."""
+    sensing: Sequence[str] = ("stops",)
+    """When the robot measures and decides, each one a run of its own at every placement: `setting.SENSING`.
+    (`EnvConfig.exploration.scan_every` and `decide` are replaced, or kept where they fit: see `Setting.configured`.)"""
     seeds: Sequence[int] = (0,)
     """Seeds of the environment; each is one start and one stream of noise on every plan."""
     config: EnvConfig = field(default_factory=EnvConfig)
     """The environment."""
 
     def __post_init__(self) -> None:
-        for name in ("policies", "plans", "placements", "seeds"):
+        for name in ("policies", "plans", "placements", "sensing", "seeds"):
             if len(getattr(self, name)) == 0:
                 raise InvalidConfigError(f"study.{name}: is empty")
-        for name in ("placements", "seeds"):
+        for name in ("placements", "sensing", "seeds"):
             values = list(getattr(self, name))
             if len(set(values)) != len(values):
                 raise InvalidConfigError(f"study.{name} = {values}: one is there twice")
@@ -69,20 +69,24 @@ class Study:
         if len(set(hashes)) != len(hashes):
             twice = next(plan.name for i, plan in enumerate(self.plans) if plan.content_hash in hashes[:i])
             raise InvalidConfigError(f"study.plans: {twice!r} has the geometry of another plan and would count twice")
-        for placement in self.placements:
-            self.config_for(placement)
+        for setting in self.settings:
+            setting.configured(self.config)
 
-    def config_for(self, placement: str) -> EnvConfig:
-        """The environment's configuration with nodes placed so."""
-        exploration = dataclasses.replace(self.config.exploration, placement=placement)  # type: ignore[arg-type]
-        return dataclasses.replace(self.config, exploration=exploration)
+    @property
+    def settings(self) -> list[Setting]:
+        """All placements with the first way to sense, then with the next."""
+        return [Setting(placement, sensing) for sensing in self.sensing for placement in self.placements]
+
+    def config_for(self, placement: str, sensing: str = "stops") -> EnvConfig:
+        """The environment's configuration in a setting."""
+        return Setting(placement, sensing).configured(self.config)
 
     def tasks(self) -> Iterator[Task]:
         """The episodes, plan by plan, so that a worker meets a plan in one go."""
         for plan in self.plans:
             for seed in self.seeds:
-                for placement in self.placements:
-                    config = self.config_for(placement)
+                for setting in self.settings:
+                    config = setting.configured(self.config)
                     for label, policy in self.policies.items():
                         yield Task(policy, label, plan, seed, config)
 
@@ -95,6 +99,7 @@ class Study:
             "study": {
                 "policies": {label: _described(spec) for label, spec in self.policies.items()},
                 "placements": list(self.placements),
+                "sensing": list(self.sensing),
                 "seeds": list(self.seeds),
                 "config": config,
                 "plans": [{"name": p.name, "hash": p.content_hash, "group": building(p)} for p in self.plans],
@@ -116,7 +121,7 @@ class Task:
     @property
     def key(self) -> Key:
         """The key of its record."""
-        return self.label, self.config.exploration.placement, self.plan.content_hash, self.seed
+        return self.label, *Setting.of(self.config), self.plan.content_hash, self.seed
 
 
 def name_policies(specs: Iterable[PolicySpec]) -> dict[str, PolicySpec]:
@@ -275,7 +280,7 @@ def _run_task(task: Task, make_env: MakeEnv) -> EpisodeRecord:
     return record
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=8)
 def _env(make_env: MakeEnv, config: EnvConfig) -> gymnasium.Env:
     """A worker's environment for a configuration, kept between its episodes."""
     return make_env(config)

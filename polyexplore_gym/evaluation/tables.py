@@ -10,21 +10,24 @@ from pathlib import Path
 
 from polyexplore_gym.errors import ResultsError
 from polyexplore_gym.evaluation.bounds import RATIOS
+from polyexplore_gym.evaluation.setting import Setting
 from polyexplore_gym.evaluation.statistics import Interval
 from polyexplore_gym.evaluation.summary import METRICS, Comparison, Row, Summary
 
-_FIGURES = ("distance", "IQM", "seen%", "90%", "95%", "99%", "AUC", "scans", "time", "bumps", "ms")
-_HEADER = ("placement", "policy", "complete", *_FIGURES)
+_FIGURES = ("distance", "IQM", "seen%", "90%", "95%", "99%", "AUC", "steps", "scans", "time", "bumps", "ms")
+_HEADER = ("setting", "policy", "complete", *_FIGURES)
 _BOUNDS = {"/stops": "over_stops", "/sensing": "over_sensing", "/lower": "over_lower"}
-_COMPARISON_HEADER = ("placement", "policy", "against", "pairs", "ratio", "P(shorter)", "p", "p Holm")
+_COMPARISON_HEADER = ("setting", "policy", "against", "pairs", "ratio", "time ratio", "P(shorter)", "p", "p Holm")
 LEGEND = """\
-complete: episodes that left nothing, of all; unreached: those that ended by themselves, but with jump edges that could
-not be reached or were given up; short: those that saw less of the plan than others. All figures are over the complete
-and the unreached ones. distance: mean driven until no reachable jump edge was left, m, with its 95 % interval; IQM: its
-interquartile mean; seen%: mean share of the free area seen by then; 90%, 95%, 99%: mean driven until so much was seen,
-m; AUC: mean coverage over the longest distance compared on the plan; scans, time (s), bumps: means an episode; ms: mean
-decision. ratio: geometric mean of the distances' ratios, below 1 is shorter; P(shorter): probability of the shorter way
-on the same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: so many starts only."""
+setting: where nodes are placed; moving: scans and decisions on the way, passing: scans on the way but decisions at
+nodes, neither: both at nodes, where the robot stops. complete: episodes that left nothing, of all; unreached: those
+that ended by themselves, but with jump edges that could not be reached or were given up; short: those that saw less of
+the plan than others. All figures are over the complete and the unreached ones. distance: mean driven until no reachable
+jump edge was left, m, with its 95 % interval; IQM: its interquartile mean; seen%: mean share of the free area seen by
+then; 90%, 95%, 99%: mean driven until so much was seen, m; AUC: mean coverage over the longest distance compared on the
+plan; steps (decisions), scans, time (simulated, s), bumps: means an episode; ms: mean decision. ratio: geometric mean
+of the distances' ratios, below 1 is shorter; time ratio: that of the simulated times; P(shorter): probability of the
+shorter way on the same plan and start; p: Wilcoxon signed-rank test. A figure in brackets: so many starts only."""
 LEGEND_BOUNDS = """\
 /stops, /sensing, /lower: mean of the distance over that of the best known tour which knows the plan and scans at
 stops, over that of the best known one which knows it and senses all round all the way, and over the proven lower bound
@@ -41,10 +44,10 @@ def summary_tables(summary: Summary) -> list[Table]:
     tables: list[Table] = [("", header, [_row(row, bool(summary.bounds)) for row in summary.rows])]
     if summary.against_reference:
         lines = [_comparison(c, c.theirs[0]) for c in summary.against_reference]
-        tables.append(("Policies, at the same placement:", _COMPARISON_HEADER, lines))
-    if summary.between_placements:
-        lines = [_comparison(c, c.theirs[1]) for c in summary.between_placements]
-        tables.append(("Placements, with the same policy:", _COMPARISON_HEADER, lines))
+        tables.append(("Policies, in the same setting:", _COMPARISON_HEADER, lines))
+    if summary.between_settings:
+        lines = [_comparison(c, str(c.theirs[1])) for c in summary.between_settings]
+        tables.append(("Settings, with the same policy:", _COMPARISON_HEADER, lines))
     return tables
 
 
@@ -81,16 +84,16 @@ def write_tables(summary: Summary, folder: Path) -> list[Path]:
 
 
 def summary_csv(summary: Summary) -> str:
-    """Every figure of every row, with its interval, one row a policy and placement."""
+    """Every figure of every row, with its interval, one row a policy and setting."""
     names = [*METRICS, "auc", *(RATIOS if summary.bounds else ())]
-    header = ["policy", "placement", "episodes", "complete", "unreached", "short", "truncated", "failed"]
+    header = ["policy", *Setting._fields, "episodes", "complete", "unreached", "short", "truncated", "failed"]
     for name in names:
         header += [
             f"{name}_{part}" for part in ("pairs", "mean", "mean_low", "mean_high", "iqm", "iqm_low", "iqm_high")
         ]
     lines: list[list[object]] = []
     for row in summary.rows:
-        line: list[object] = [row.policy, row.placement, row.episodes, row.complete]
+        line: list[object] = [row.policy, *row.setting, row.episodes, row.complete]
         line += [row.unreached, row.short, row.truncated, row.failed]
         for name in names:
             metric = row.metrics.get(name)
@@ -101,21 +104,16 @@ def summary_csv(summary: Summary) -> str:
 
 def comparisons_csv(summary: Summary) -> str:
     """Every comparison, one a row."""
-    header = ["policy", "placement", "against_policy", "against_placement", "pairs", "buildings"]
-    header += ["ratio", "ratio_low", "ratio_high", "p_shorter", "p_shorter_low", "p_shorter_high", "p", "p_holm"]
-    lines = [
-        [
-            *c.ours,
-            *c.theirs,
-            c.pairs,
-            c.buildings,
-            *_cells(c.ratio),
-            *_cells(c.improvement),
-            _cell(c.p),
-            _cell(c.p_holm),
-        ]
-        for c in [*summary.against_reference, *summary.between_placements]
-    ]
+    side = ("policy", *Setting._fields)
+    header = [*side, *(f"against_{name}" for name in side), "pairs", "buildings"]
+    header += [f"{name}{end}" for name in ("ratio", "time", "p_shorter") for end in ("", "_low", "_high")]
+    header += ["p", "p_holm"]
+    lines: list[list[object]] = []
+    for c in [*summary.against_reference, *summary.between_settings]:
+        (ours, here), (theirs, there) = c.ours, c.theirs
+        line: list[object] = [ours, *here, theirs, *there, c.pairs, c.buildings]
+        line += [*_cells(c.ratio), *_cells(c.time), *_cells(c.improvement), _cell(c.p), _cell(c.p_holm)]
+        lines.append(line)
     return _csv(header, lines)
 
 
@@ -146,7 +144,7 @@ def _row(row: Row, bounds: bool) -> list[str]:
     distance = row.metrics.get("distance")
     compared = distance.pairs if distance else 0
     return [
-        row.placement,
+        str(row.setting),
         row.policy,
         _counts(row),
         interval_text(distance.mean, 1) if distance and compared else "-",
@@ -156,6 +154,7 @@ def _row(row: Row, bounds: bool) -> list[str]:
         mean("distance_95", 1),
         mean("distance_99", 1),
         mean("auc", 3),
+        mean("decisions", 1),
         mean("measurements", 1),
         mean("sim_time", 0),
         mean("collisions", 2),
@@ -173,11 +172,12 @@ def _counts(row: Row) -> str:
 
 def _comparison(c: Comparison, against: str) -> list[str]:
     return [
-        c.ours[1],
+        str(c.ours[1]),
         c.ours[0],
         against,
         str(c.pairs),
         interval_text(c.ratio, 3) if c.pairs else "-",
+        interval_text(c.time, 2) if c.pairs else "-",
         interval_text(c.improvement, 2) if c.pairs else "-",
         _p(c.p),
         _p(c.p_holm),

@@ -38,6 +38,9 @@ class FakeEnv(gymnasium.Env):
         self.nodes = self.np_random.uniform(0.0, self.plan.bounds[2], size=(SLOTS, 2))
         if self.config.exploration.placement == "in_front":
             self.nodes *= 0.9
+        self.moving = self.config.exploration.decide != "arrival"
+        if self.moving:
+            self.nodes *= 0.7
         self.edges = self.np_random.uniform(0.5, 3.0, size=SLOTS)
         self.open = np.ones(SLOTS, dtype=np.int8)
         self.distance, self.steps, self.bad = 0.0, 0, False
@@ -86,6 +89,7 @@ class FakeEnv(gymnasium.Env):
             "sim_time": 2.0 * self.distance,
             "collisions": 0,
             "invalid_action": self.bad,
+            "ended": "invalid" if self.bad else "settled" if self.moving else "arrived" if self.steps else "start",
             "outcome": {
                 "status": status,
                 "unreached": left,

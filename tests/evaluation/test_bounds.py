@@ -17,6 +17,7 @@ def record(policy: str, number: int, distance: float) -> EpisodeRecord:
     return EpisodeRecord(
         policy=policy,
         placement="midpoint",
+        sensing="stops",
         plan=f"plan {number}",
         plan_hash=f"hash {number}",
         group=f"building {number}",
@@ -82,7 +83,7 @@ def test_from_the_command_to_the_page(tmp_path, capsys):
     save_plan(plan, tmp_path / "plan.json")
     command = ["bench", "--plans", str(tmp_path / "plan.json"), "--policies", "nearest", "random", "--seeds", "2"]
     command += ["--drive", "kinematic", "--workers", "1", "--no-plots", "--out", str(tmp_path / "out")]
-    command += ["--bounds", str(tmp_path / "references")]
+    command += ["--sensing", "stops", "--bounds", str(tmp_path / "references")]
     assert main(command) == 0
     printed = capsys.readouterr().out
     found = read_bounds(tmp_path / "out")

@@ -19,6 +19,7 @@ def study() -> Study:
         policies=name_policies(["nearest", "random", "distance_advantage"]),
         plans=[FloorPlan.create(np.array(ROOMS) * scale, name=f"rooms {scale}") for scale in (1.0, 0.7)],
         placements=("midpoint", "in_front"),
+        sensing=("stops", "moving"),
         seeds=(0, 5),
         config=EnvConfig(drive=DriveConfig(mode="kinematic")),
     )
@@ -36,6 +37,8 @@ def test_records_do_not_depend_on_workers_or_order(study, records, tmp_path):
         assert (np.diff(r.curve_distance) >= 0).all()
         assert (np.diff(r.curve_coverage) >= 0).all()
         assert len(r.curve_distance) == r.decisions + 1
+        assert sum(r.ends.values()) == r.decisions
+        assert r.ends.get("settled", 0) == 0 or r.sensing == "moving"
         assert r.reward == pytest.approx(-r.distance, abs=1e-3)
 
 
@@ -46,6 +49,12 @@ def test_an_episode_can_be_seen_again(study, records):
             snapshot, again = replay(env, load_policy(task.policy), task.plan, task.seed, label=task.label)
             assert again == record
             assert snapshot.distance == pytest.approx(record.distance, abs=1e-6)
+
+
+def test_moving_is_moving(records):
+    ways = {s: [r.distance for r in records if r.policy == "nearest" and r.sensing == s] for s in ("stops", "moving")}
+    assert sum(ways["moving"]) < 0.95 * sum(ways["stops"])
+    assert sum(r.ends.get("settled", 0) for r in records) > 10
 
 
 def test_trajectories_show_every_policy(study):

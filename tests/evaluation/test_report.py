@@ -15,14 +15,15 @@ import pytest
 from PIL import Image
 
 from polyexplore_gym.cli import main
-from polyexplore_gym.config import DriveConfig, EnvConfig, SensorConfig
+from polyexplore_gym.config import DriveConfig, EnvConfig, ExplorationConfig, SensorConfig
 from polyexplore_gym.errors import MissingDependencyError, ResultsError
-from polyexplore_gym.evaluation import Study, evaluate, name_policies, read_records, summarize, write_tables
+from polyexplore_gym.evaluation import Setting, Study, evaluate, name_policies, read_records, summarize, write_tables
 from polyexplore_gym.evaluation.report import render_report, write_report
 from polyexplore_gym.evaluation.results import EPISODES, MANIFEST, read_plan
 from polyexplore_gym.evaluation.tables import summary_tables
 from polyexplore_gym.floorplan import FloorPlan
 
+SETTINGS = ["midpoint", "midpoint, moving"]
 ROOMS = np.array([[0, 0], [9, 0], [9, 4], [5, 4], [5, 6], [9, 6], [9, 9], [0, 9], [0, 5], [3, 5], [3, 4], [0, 4]])
 
 
@@ -94,9 +95,13 @@ def results(tmp_path_factory) -> Path:
     study = Study(
         policies=name_policies(["random", "nearest", "modified_sum", f"{__name__}:Broken"]),
         plans=plans,
-        placements=("midpoint", "in_front"),
+        sensing=("stops", "moving"),
         seeds=(0, 5),
-        config=EnvConfig(drive=DriveConfig(mode="kinematic"), sensor=SensorConfig(beams=181)),
+        config=EnvConfig(
+            drive=DriveConfig(mode="kinematic"),
+            sensor=SensorConfig(beams=181),
+            exploration=ExplorationConfig(scan_every=0.25),
+        ),
     )
     records = evaluate(study, out=folder, progress=False)
     write_tables(summarize(records, np.random.default_rng(0)), folder)
@@ -120,7 +125,7 @@ def test_the_page_stands_on_its_own(page):
 
 
 def test_every_picture_decodes_and_has_a_text(page):
-    # Profiles, curves, ratios and probabilities: one a placement, and those between the placements; two runs of two.
+    # Profiles, curves, ratios and probabilities: one a setting, and those between the settings; two runs of two.
     assert len(page.images) >= 2 + 2 + 3 + 3 + 4
     for image in page.images:
         assert len(image["alt"]) > 5
@@ -138,7 +143,8 @@ def test_tables_hold_the_figures_of_the_summary(page, results):
     assert len(rows) == len(expected) == 8
     for row, figures in zip(rows, expected, strict=True):
         cells = dict(zip(header, row, strict=True))
-        assert (cells["placement"], cells["policy"]) == (figures["placement"], figures["policy"])
+        setting = Setting(figures["placement"], figures["sensing"])
+        assert (cells["setting"], cells["policy"]) == (str(setting), figures["policy"])
         assert cells["complete"].split()[0] == f"{figures['complete']}/{figures['episodes']}"
         if figures["distance_mean"]:
             mean, low, high = (float(part.strip("[],")) for part in cells["distance"].split())
@@ -146,7 +152,7 @@ def test_tables_hold_the_figures_of_the_summary(page, results):
                 assert found == pytest.approx(float(figures[f"distance_{name}"]), abs=0.0501)
     records = sorted(read_records(results), key=lambda r: r.key)
     ratios = {(row[0], row[1], row[2]): row for table in page.tables["results"][1:] for row in table[1:]}
-    done = {(r.policy, r.placement, r.plan_hash, r.seed): r.distance for r in records if r.ended}
+    done = {(r.policy, str(r.setting), *r.pair): r.distance for r in records if r.ended}
     common = {(h, s) for p, where, h, s in done if where == "midpoint"}
     common = {pair for pair in common if all((p, "midpoint", *pair) in done for p in ("nearest", f"{__name__}:Broken"))}
     logs = [np.log(done["random", "midpoint", *k] / done["nearest", "midpoint", *k]) for k in common]
@@ -155,8 +161,9 @@ def test_tables_hold_the_figures_of_the_summary(page, results):
     # All cells are those of the terminal's tables, in their order.
     order = [p["hash"] for p in json.loads((results / MANIFEST).read_text())["study"]["plans"]]
     policies = ["random", "nearest", "modified_sum", f"{__name__}:Broken"]
-    places = ["midpoint", "in_front"]
-    records.sort(key=lambda r: (order.index(r.plan_hash), r.seed, places.index(r.placement), policies.index(r.policy)))
+    records.sort(
+        key=lambda r: (order.index(r.plan_hash), r.seed, SETTINGS.index(str(r.setting)), policies.index(r.policy))
+    )
     tables = summary_tables(summarize(records, np.random.default_rng(0)))
     assert [[list(header), *rows] for _, header, rows in tables] == page.tables["results"]
 
@@ -168,12 +175,12 @@ def test_failures_parts_and_set_up_are_told(page, results):
     assert sum(row[4] == "failed" for row in rows) == len(failed)
     assert {row[-1] for row in rows if row[4] == "failed"} == {r.error for r in failed}  # as text, not as a script
     assert "rooms <1.2>" in page.text
-    for table, placement in zip(page.tables["breakdown"], ("midpoint", "in_front"), strict=True):
+    for table, setting in zip(page.tables["breakdown"], SETTINGS, strict=True):
         assert table[0] == ["plans", "starts", "random", "modified_sum", f"{__name__}:Broken"]
         starts = {row[0]: int(row[1]) for row in table[1:]}
         assert starts.keys() == {"large", "small", "up to 100 m²", "100 to 500 m²"}
         assert starts["small"] == starts["up to 100 m²"]
-        assert starts["small"] <= 6, placement
+        assert starts["small"] <= 6, setting
     versions = dict(page.tables["set-up"][0][1:])
     assert versions["numpy"] == np.__version__
     configuration = {row[0]: row[1:] for row in page.tables["set-up"][1][1:]}
@@ -193,13 +200,36 @@ def test_jump_edges_that_are_left_are_told(tmp_path):
     page = Page(render_report(tmp_path, runs=0, make_env=fake_env.FakeEnv))
     header, *rows = page.tables["failures"][0]
     assert [dict(zip(header, row, strict=True)) for row in rows] == [
-        {"policy": policy, "placement": "midpoint", "plan": "square 0", "seed": "0", "what": "unreached", "m": row[5],
+        {"policy": policy, "setting": "midpoint", "plan": "square 0", "seed": "0", "what": "unreached", "m": row[5],
          "seen %": "100.0", "edges left": "3, 3.0 m", "error": ""}
         for policy, row in zip(("nearest", "random"), rows, strict=True)
     ]  # fmt: skip
     assert "2 episodes that are compared left jump edges: 4 (5.0 m) out of reach, 2 (1.0 m) given up" in page.text
     header, *rows = page.tables["results"][0]
     assert {dict(zip(header, row, strict=True))["complete"] for row in rows} == {"2/3 (1 unreached)"}
+
+
+def test_both_ways_to_sense_stand_side_by_side(page, results):
+    records = read_records(results)
+    assert list(dict.fromkeys(row[0] for row in page.tables["results"][0][1:])) == SETTINGS
+    assert {(row[0], row[2]) for row in page.tables["results"][2][1:]} == {(SETTINGS[1], SETTINGS[0])}
+    header, *rows = page.tables["ends"][0]
+    assert header[:3] == ["setting", "policy", "drives"]
+    assert {"arrived %", "settled %"} <= set(header)
+    assert [row[0] for row in rows] == [label for label in SETTINGS for _ in range(4)]
+    for row in rows:
+        own = [r.ends for r in records if [str(r.setting), r.policy] == row[:2]]
+        drives = sum(sum(ends.values()) for ends in own)
+        assert int(row[2]) == drives
+        for name, share in zip(header[3:], row[3:], strict=True):
+            count = sum(ends.get(name.removesuffix(" %"), 0) for ends in own)
+            assert (share == "-") == (count == 0)
+            assert share == "-" or float(share) == pytest.approx(100 * count / drives, abs=0.0051)
+    (settings,) = (t for t in page.tables["set-up"] if t[0][0] == "setting")
+    assert settings[1:] == [
+        ["midpoint", "midpoint", "0.0", "arrival"],
+        ["midpoint, moving", "midpoint", "0.25", "settled"],
+    ]
 
 
 def test_runs_are_drawn_as_they_were(page):
@@ -235,7 +265,7 @@ def test_a_killed_run_has_a_page_too(results, tmp_path):
     assert "21 of 64" in page.text
     assert "does not hold the floor plans" in page.text
     counts = {tuple(row[:2]): row[2] for row in page.tables[""][0][1:]}
-    found = [r for r in read_records(results) if (r.placement, r.policy) == ("midpoint", "nearest")]
+    found = [r for r in read_records(results) if (str(r.setting), r.policy) == ("midpoint", "nearest")]
     assert len(found) == 8
     assert counts["midpoint", "nearest"].endswith("of 8")
     assert sum(int(count.split()[0]) for count in counts.values()) == 43

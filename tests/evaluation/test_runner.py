@@ -15,15 +15,23 @@ from polyexplore_gym.config import EnvConfig, SensorConfig
 from polyexplore_gym.errors import InvalidConfigError, ResultsError
 from polyexplore_gym.evaluation import Study, evaluate, load_policy, name_policies, read_records
 from polyexplore_gym.evaluation.episode import run_episode
-from polyexplore_gym.evaluation.results import EPISODES, MANIFEST
+from polyexplore_gym.evaluation.results import EPISODES, FORMAT, MANIFEST
 
 
-def study(policies=("nearest", "random"), plans=3, seeds=(0, 1), placements=("midpoint", "in_front"), **meta) -> Study:
+def study(
+    policies=("nearest", "random"),
+    plans=3,
+    seeds=(0, 1),
+    placements=("midpoint", "in_front"),
+    sensing=("stops",),
+    **meta,
+) -> Study:
     return Study(
         policies=name_policies(policies),
         plans=[plan(i, **meta) for i in range(plans)],
         seeds=seeds,
         placements=placements,
+        sensing=sensing,
     )
 
 
@@ -43,7 +51,8 @@ def test_a_record_says_what_happened():
         here = env.nodes[left.pop(int(np.argmin(gaps)))]
     coverage = [0.4 + 0.6 * i / 8 for i in range(9)]
     assert record.status == "complete"
-    assert (record.group, record.stratum, record.drive, record.placement) == ("b7", "home", "physics", "midpoint")
+    assert (record.group, record.stratum, record.drive) == ("b7", "home", "physics")
+    assert (record.placement, record.sensing, record.ends) == ("midpoint", "stops", {"arrived": 8})
     np.testing.assert_allclose(record.curve_distance, driven, atol=1e-4)
     np.testing.assert_allclose(record.curve_coverage, coverage, atol=1e-6)
     assert record.distance == pytest.approx(driven[-1], abs=1e-6)
@@ -55,23 +64,31 @@ def test_a_record_says_what_happened():
     assert set(record.timing) == {"act_mean", "act_median", "act_max", "episode"}
 
 
-def test_all_policies_meet_the_same_points_and_placement_is_set():
+def test_all_policies_meet_the_same_points_in_every_setting():
     seen = {}
 
     class Spy(FakeEnv):
         def reset(self, **kwargs):
             result = super().reset(**kwargs)
-            seen.setdefault((self.plan.name, kwargs["seed"]), []).append(
-                (self.config.exploration.placement, self.nodes.tobytes())
-            )
+            c = self.config.exploration
+            where = c.placement, c.scan_every, c.decide
+            seen.setdefault((self.plan.name, kwargs["seed"]), []).append((where, self.nodes.tobytes()))
             return result
 
-    evaluate(study(["nearest", "largest", "random"]), progress=False, make_env=Spy)
+    a_study = study(["nearest", "largest", "random"], sensing=("stops", "moving"))
+    records = evaluate(a_study, progress=False, make_env=Spy)
+    settings = [("midpoint", 0.0, "arrival"), ("in_front", 0.0, "arrival"), ("midpoint", 0.5, "settled"),
+                ("in_front", 0.5, "settled")]  # fmt: skip
     assert len(seen) == 6
     for starts in seen.values():
-        assert len(starts) == 6
-        assert len(set(starts)) == 2  # one a placement
-    assert len({nodes for starts in seen.values() for _, nodes in starts}) == 12
+        assert [where for where, _ in starts] == [where for where in settings for _ in range(3)]
+        assert len(set(starts)) == 4
+    assert len({nodes for starts in seen.values() for _, nodes in starts}) == 24
+    assert [str(setting) for setting in a_study.settings] == ["midpoint", "in_front", "midpoint, moving",
+                                                              "in_front, moving"]  # fmt: skip
+    assert [r.key for r in records] == [task.key for task in a_study.tasks()]
+    assert {(r.sensing, *r.ends) for r in records} == {("stops", "arrived"), ("moving", "settled")}
+    assert len({r.key for r in records}) == len(records) == 72
 
 
 @pytest.mark.parametrize("policies", [("nearest", "random", "utility:rate=0.5"), None])
@@ -93,6 +110,7 @@ def test_failures_and_truncations_are_recorded(tmp_path):
     assert all(r.error is None for r in records if r.status != "failed")
     stubborn = next(r for r in records if r.policy == "stubborn")
     assert (stubborn.invalid_actions, stubborn.decisions) == (11, 12)
+    assert stubborn.ends == {"arrived": 1, "invalid": 11}
     assert stubborn.distance_90 is None
     assert run(study([Fussy(), Stubborn(), "nearest"], plans=8, seeds=(0,), budget=12), tmp_path) == records
 
@@ -187,6 +205,7 @@ def test_a_damaged_middle_line_stops_with_its_number(tmp_path):
                 read()
     value = json.loads(lines[2])
     wrongs = [("status", "odd"), ("distance", "far"), ("seed", 1.5), ("policy", None), ("coverage", None)]
+    wrongs += [("sensing", "odd"), ("ends", 3), ("ends", {"arrived": "often"}), ("ends", {"arrived": True})]
     wrongs += [("curve_distance", [0.0]), ("curve_distance", 3), ("curve_coverage", ["x"])]
     for field, wrong in wrongs:
         path.write_bytes(b"".join([*lines[:2], json.dumps({**value, field: wrong}).encode() + b"\n", *lines[3:]]))
@@ -202,6 +221,7 @@ def test_a_folder_of_another_study_is_refused(tmp_path):
         r"study\.seeds\[1\] is 1 there, 4 here": study(seeds=(0, 4)),
         r"study\.policies\.largest": study(["nearest", "random", "largest"]),
         r"study\.placements": study(placements=("midpoint",)),
+        r"study\.sensing\[0\] is 'stops' there, 'moving' here": study(sensing=("moving",)),
         r"study\.config\.sensor\.beams is 361 there, 181 here": Study(
             policies=name_policies(["nearest", "random"]),
             plans=study().plans,
@@ -245,6 +265,17 @@ def test_a_folder_of_another_study_is_refused(tmp_path):
         run(study(), tmp_path)
 
 
+def test_a_folder_of_an_older_version_is_refused(tmp_path):
+    run(study(), tmp_path)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    (tmp_path / MANIFEST).write_text(json.dumps({**manifest, "format": FORMAT - 1}))
+    for read in (lambda: run(study(), tmp_path), lambda: read_records(tmp_path)):
+        with pytest.raises(
+            ResultsError, match=f"results in format {FORMAT - 1}, this version .* {FORMAT}: choose another"
+        ):
+            read()
+
+
 def test_folders_that_cannot_be_used(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
@@ -272,6 +303,9 @@ def test_two_runs_do_not_write_into_one_folder(tmp_path):
         ({"seeds": (1, 1)}, "twice"),
         ({"seeds": (-1,)}, "seeds"),
         ({"placements": ("middle",)}, "placement"),
+        ({"sensing": ("fast",)}, "sensing = 'fast': must be one of stops, passing, moving"),
+        ({"sensing": ("stops", "stops")}, r"study\.sensing.*twice"),
+        ({"sensing": ()}, r"study\.sensing: is empty"),
         ({"plans": 0}, "plans"),
         ({"policies": ["nearest", "nearest"]}, "two policies"),
     ],

@@ -9,6 +9,7 @@ from fake_env import FakeEnv, Fussy, Stubborn, plan
 from polyexplore_gym.errors import ResultsError
 from polyexplore_gym.evaluation import (
     EpisodeRecord,
+    Setting,
     Study,
     evaluate,
     name_policies,
@@ -21,10 +22,13 @@ from polyexplore_gym.evaluation.summary import finished
 from polyexplore_gym.evaluation.tables import format_table, summary_csv
 
 
-def record(policy, number, distance, *, seed=0, placement="midpoint", status="complete", group=None, **more):
+def record(
+    policy, number, distance, *, seed=0, placement="midpoint", sensing="stops", status="complete", group=None, **more
+):
     return EpisodeRecord(
         policy=policy,
         placement=placement,
+        sensing=sensing,
         plan=f"plan {number}",
         plan_hash=f"hash {number}",
         group=group or f"building {number}",
@@ -36,8 +40,11 @@ def record(policy, number, distance, *, seed=0, placement="midpoint", status="co
         coverage=1.0,
         curve_distance=(0.0, distance / 2, distance),
         curve_coverage=(0.25, 0.5, 1.0),
-        **more,
+        **{"sim_time": 2.0 * distance, **more},
     )
+
+
+MIDPOINT, IN_FRONT = Setting("midpoint"), Setting("in_front")
 
 
 def figures(records, **options):
@@ -66,12 +73,12 @@ def test_means_and_ratios_by_hand():
     areas = [(5 * 0.25 + 5 * 0.5 + 10) / 20, 0.375, 0.375, (15 * 0.25 + 15 * 0.5 + 30) / 60]
     assert nearest["auc"].mean.estimate == pytest.approx(np.mean(areas))
     (comparison,) = summary.against_reference
-    assert (comparison.ours, comparison.theirs) == (("far", "midpoint"), ("nearest", "midpoint"))
+    assert (comparison.ours, comparison.theirs) == (("far", MIDPOINT), ("nearest", MIDPOINT))
     assert comparison.ratios == pytest.approx((2.0, 1.0, 0.5, 2.0))
-    assert comparison.ratio.estimate == pytest.approx(2.0**0.25)
+    assert comparison.ratio.estimate == comparison.time.estimate == pytest.approx(2.0**0.25)
     assert comparison.improvement.estimate == pytest.approx((0 + 0.5 + 1 + 0) / 4)
     assert comparison.buildings == 4
-    assert summary.between_placements == []
+    assert summary.between_settings == []
 
 
 def test_only_starts_that_all_finished_are_compared():
@@ -102,21 +109,58 @@ def test_only_starts_that_all_finished_are_compared():
     assert "0/6 (6 failed)" in text
 
 
-def test_placements_are_compared_apart():
+def test_settings_are_compared_apart():
     records = []
     for i in range(5):
         records += [record("nearest", i, 10.0 + i), record("b", i, 12.0 + i)]
         records += [record("nearest", i, 5.0 + i / 2, placement="in_front"), record("b", i, 24.0, placement="in_front")]
     summary = figures(records)
     assert [(c.ours, c.theirs) for c in summary.against_reference] == [
-        (("b", "midpoint"), ("nearest", "midpoint")),
-        (("b", "in_front"), ("nearest", "in_front")),
+        (("b", MIDPOINT), ("nearest", MIDPOINT)),
+        (("b", IN_FRONT), ("nearest", IN_FRONT)),
     ]
-    between = {c.ours[0]: c for c in summary.between_placements}
+    between = {c.ours[0]: c for c in summary.between_settings}
     assert between["nearest"].ratio.estimate == pytest.approx(0.5)
-    assert between["nearest"].theirs == ("nearest", "midpoint")
+    assert between["nearest"].theirs == ("nearest", MIDPOINT)
     assert between["b"].ratio.estimate > 1.5
     assert between["nearest"].improvement.estimate == 1.0
+
+
+def test_settings_that_differ_in_one_factor_are_compared():
+    length = {("midpoint", "stops"): 10.0, ("in_front", "stops"): 9.0, ("midpoint", "moving"): 7.0,
+              ("in_front", "moving"): 5.4}  # fmt: skip
+    records = [
+        record("nearest", i, d + i, placement=placement, sensing=sensing, sim_time=3.0 * d * (sensing == "stops") + d)
+        for i in range(4)
+        for (placement, sensing), d in length.items()
+    ]
+    summary = figures(records)
+    found = {(c.ours[1], c.theirs[1]): c for c in summary.between_settings}
+    moving, in_front_moving = MIDPOINT._replace(sensing="moving"), IN_FRONT._replace(sensing="moving")
+    assert list(found) == [
+        (IN_FRONT, MIDPOINT),
+        (in_front_moving, moving),
+        (moving, MIDPOINT),
+        (in_front_moving, IN_FRONT),
+    ]
+    by_hand = [(7.0 + i) / (10.0 + i) for i in range(4)]
+    assert found[moving, MIDPOINT].ratios == pytest.approx(by_hand)
+    assert found[moving, MIDPOINT].ratio.estimate == pytest.approx(np.exp(np.mean(np.log(by_hand))))
+    assert found[moving, MIDPOINT].time.estimate == pytest.approx(0.7 / 4)
+    assert found[in_front_moving, IN_FRONT].time.estimate == pytest.approx(0.6 / 4)
+    assert [row.setting for row in summary.rows] == [MIDPOINT, IN_FRONT, moving, in_front_moving]
+    text = summary_text(summary).splitlines()
+    (line,) = [line for line in text if line.split("  ")[0] == "midpoint, moving" and "0.17 [" in line]
+    assert line.split()[:5] == ["midpoint,", "moving", "nearest", "midpoint", "4"]
+    assert "midpoint, moving: compared on 4 of 4 starts, those finished by all 1 policies" in text
+    # A setting that is not there is not compared with.
+    some = figures([r for r in records if r.setting in (MIDPOINT, in_front_moving)])
+    assert some.between_settings == []
+    assert [panel.get_title() for panel in coverage_figure(records).axes] == [
+        "midpoint (4 starts)", "in_front (4 starts)", "midpoint, moving (4 starts)", "in_front, moving (4 starts)",
+    ]  # fmt: skip
+    labels = [tick.get_text() for tick in ratio_figure(summary).axes[0].get_yticklabels()]
+    assert labels[2] == "nearest\nmidpoint, moving / midpoint"
 
 
 def test_one_building_has_no_interval_and_no_test():
@@ -171,13 +215,17 @@ def test_tables_are_written_and_agree(records, tmp_path):
     rows = list(csv.DictReader(io.StringIO((tmp_path / "summary.csv").read_text())))
     assert len(rows) == 10
     for row, expected in zip(rows, summary.rows, strict=True):
-        assert (row["policy"], row["placement"]) == (expected.policy, expected.placement)
+        assert (row["policy"], row["placement"], row["sensing"]) == (expected.policy, *expected.setting)
         if expected.metrics:
             metric = expected.metrics["distance"]
             assert float(row["distance_mean"]) == pytest.approx(metric.mean.estimate, rel=1e-5)
             assert float(row["distance_iqm_low"]) == pytest.approx(metric.iqm.low, rel=1e-5)
     comparisons = list(csv.DictReader(io.StringIO((tmp_path / "comparisons.csv").read_text())))
-    assert len(comparisons) == len(summary.against_reference) + len(summary.between_placements)
+    assert len(comparisons) == len(summary.against_reference) + len(summary.between_settings)
+    for row, expected in zip(comparisons, [*summary.against_reference, *summary.between_settings], strict=True):
+        assert (row["placement"], row["sensing"]) == expected.ours[1]
+        assert (row["against_placement"], row["against_sensing"]) == expected.theirs[1]
+        assert float(row["time_high"]) == pytest.approx(expected.time.high, rel=1e-5)
     with pytest.raises(ResultsError, match="cannot be written"):
         write_tables(summary, tmp_path / "nowhere")
 
@@ -206,8 +254,8 @@ def test_figures_show_all_policies(records, tmp_path):
     assert (np.diff(y) >= -1e-9).all()
     summary = figures(records)
     forest = ratio_figure(summary)
-    labels = [tick.get_text() for tick in forest.axes[0].get_yticklabels()]
-    assert len(labels) == len(summary.against_reference) + len(summary.between_placements)
+    left, right = ([tick.get_text() for tick in panel.get_yticklabels()] for panel in forest.axes)
+    assert (len(left), len(right)) == (len(summary.against_reference), len(summary.between_settings))
     for name, drawn in (("coverage.png", figure), ("ratios.png", forest)):
         picture = matplotlib.image.imread(save(drawn, tmp_path / name))
         assert picture.std() > 0.01
