@@ -6,8 +6,10 @@ Robots are drawn evenly in the logarithm: radius 0.02 to 2 m, speed 0.05 to 50 m
 that is legal), acceleration 0.2 to 200 times the speed in a second, turn rate 0.3 to 30 rad/s, reached in 5 ms to 2 s.
 So a step may be a thousandth of the radius or hundreds of radii. The scenes are drawn in radii, turned and moved: a
 wall met at any angle; a wall driven along, at a grazing angle; corners from outside and from inside; a door a little
-wider or narrower than the disc; and walls strewn at random. In every scene the robot drives five times, each time from
-where it stands: a quarter of these drives goes on as before, against what stopped it.
+wider or narrower than the disc; and walls strewn at random. In every scene the robot drives eight times, each time from
+where it is: a quarter of these drives goes on as before, against what stopped it. Half of them are cut short at random,
+so that the next begins at speed: along the rest of the path, or a new one that leads through the place where the robot
+can halt, or anywhere.
 
 One row a mode: drives that passed through a wall (the centre of the disc met one), the deepest overlap of disc and
 wall anywhere on the way and where the robot stood in the end, and the greatest jump: way between two poses beyond speed
@@ -32,7 +34,7 @@ from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
 from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.sim.world import DriveResult, World
 
-DRIVES_A_SCENE = 5
+DRIVES_A_SCENE = 8
 MODES = ("physics", "kinematic")
 ALLOWED = 1e-5
 """Overlap and jump, in radii, that count as rounding."""
@@ -119,6 +121,8 @@ class Tally:
     drives: int = 0
     bumps: int = 0
     arrived: int = 0
+    cut: int = 0
+    moving: int = 0
     passed: int = 0
     way: float = -math.inf
     standing: float = -math.inf
@@ -139,6 +143,8 @@ class Tally:
         self.drives += 1
         self.bumps += result.collided
         self.arrived += result.arrived
+        self.cut += result.ended == "cut"
+        self.moving += world.velocity[0] > 0.0
         self.passed += bool(nearest <= 1e-9 * robot.radius)
         self.way = max(self.way, 1.0 - nearest / robot.radius)
         self.standing = max(self.standing, 1.0 - stands / robot.radius)
@@ -148,11 +154,12 @@ class Tally:
     def row(self) -> list[str]:
         micro = [f"{1e6 * max(value, 0.0):.3f}" for value in (self.way, self.standing, self.jump)]
         spent = f"{1e3 * self.seconds / self.drives:.2f}"
-        return [*map(str, (self.drives, self.bumps, self.arrived, self.passed)), *micro, f"{self.longest:.0f}", spent]
+        counts = (self.drives, self.bumps, self.arrived, self.cut, self.moving, self.passed)
+        return [*map(str, counts), *micro, f"{self.longest:.0f}", spent]
 
 
 def play(rng: np.random.Generator, scene: Callable[[np.random.Generator], Scene], mode: str, tally: Tally) -> None:
-    """Drive five times in a new scene."""
+    """Drive several times in a new scene."""
     walls, start, goal = scene(rng)
     robot, step = robot_and_step(rng)
     turn, shift = rng.uniform(-math.pi, math.pi), rng.uniform(-50.0, 50.0, 2)
@@ -163,16 +170,28 @@ def play(rng: np.random.Generator, scene: Callable[[np.random.Generator], Scene]
     config = DriveConfig(mode=mode, time_step=step, time_limit=100.0)  # type: ignore[arg-type]
     world = World(walls, robot, SensorConfig(), config, np.array([*start, rng.uniform(-math.pi, math.pi)]))
     lines = shapely.multilinestrings(walls.reshape(-1, 2, 2))
+    way = np.array([start, goal])
     for _ in range(DRIVES_A_SCENE):
-        way = [world.pose[:2], goal]
-        if rng.random() < 0.3:
-            way.insert(1, way[0] + rng.normal(0.0, 5.0, 2) * robot.radius)
+        cut = {}
+        if rng.random() < 0.5:
+            way_cut, turn_cut = robot.radius * log_uniform(rng, 0.01, 20.0), log_uniform(rng, 0.01, 10.0)
+            cut = {"distance": way_cut} if rng.random() < 0.7 else {"distance": way_cut, "turn": turn_cut}
         began = time.perf_counter()
-        result = world.drive(np.array(way), rng.uniform(-3.0, 3.0) if rng.random() < 0.5 else None)
+        result = world.drive(way, rng.uniform(-3.0, 3.0) if rng.random() < 0.5 else None, **cut)
         tally.seconds += time.perf_counter() - began
         tally.add(world, lines, result)
-        if rng.random() > 0.25:
-            goal = world.pose[:2] + rng.normal(0.0, 15.0, 2) * robot.radius
+        way = next_way(rng, world, way[result.next_vertex :], goal)
+
+
+def next_way(rng: np.random.Generator, world: World, rest: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """A path from where the robot is: a quarter leads on to where it was going, half first to where it can halt."""
+    here, radius = world.pose[:2], world.robot.radius
+    if rng.random() < 0.25:
+        return np.vstack([here, rest if len(rest) else goal])
+    way = [here, world.halt] if rng.random() < 0.5 else [here]
+    if rng.random() < 0.3:
+        way.append(here + rng.normal(0.0, 5.0, 2) * radius)
+    return np.array([*way, here + rng.normal(0.0, 15.0, 2) * radius])
 
 
 def main() -> int:
@@ -186,7 +205,8 @@ def main() -> int:
         play(np.random.default_rng(0), towards, mode, Tally())  # compiles the kernels
         for k in range(math.ceil(options.drives / DRIVES_A_SCENE)):
             play(rng, SCENES[k % len(SCENES)], mode, tally)
-    head = ["mode", "drives", "bumps", "arrived", "passed", "deepest", "standing", "jump", "longest step", "ms a drive"]
+    counts = ["mode", "drives", "bumps", "arrived", "cut", "at speed", "passed"]
+    head = [*counts, "deepest", "standing", "jump", "longest step", "ms a drive"]
     print(format_table(head, [[mode, *tally.row()] for mode, tally in tallies.items()]))
     print("deepest, standing and jump in millionths of the radius; longest step in radii")
     held = all(t.passed == 0 and max(t.way, t.standing, t.jump) < ALLOWED for t in tallies.values())

@@ -287,6 +287,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
                 if not len(row) or not exploration.reachable[row[0]]:
                     return "blocked"
                 path, heading = exploration.path_to(int(row[0])), float(exploration.chains.node[row[0], 2])
+                self._path = path
 
     def _drive(self, path: np.ndarray, heading: float) -> tuple[str, np.ndarray]:
         """Drive along a path (k, 2), then turn to a heading, until it is time for a scan on the way.

@@ -55,15 +55,15 @@ def test_a_drive_ends_when_its_jump_edge_is_settled(mode):
     infos = play(env)
     assert {info["ended"] for info in infos[1:]} <= ENDS
     assert infos[0]["ended"] == "start"
-    settled = 0
+    settled = short = 0
     for before, after in zip(infos, infos[1:], strict=False):
         driven = after["distance"] - before["distance"]
         if after["ended"] == "settled":
             settled += 1
-            way = np.array(after["path"])
-            assert driven < np.hypot(*np.diff(way, axis=0).T).sum() + 1e-6
+            short += driven < np.hypot(*np.diff(np.array(after["path"]), axis=0).T).sum() - 0.1
             assert after["measurements"] > before["measurements"]  # it was a scan that settled it
     assert settled > 3
+    assert short >= 0.8 * settled
     assert infos[-1]["outcome"]["status"] == "complete"
     assert infos[-1]["coverage"] > 0.98
 
@@ -114,10 +114,6 @@ def test_a_policy_that_keeps_to_the_pursued_node_arrives():
     assert info["outcome"]["status"] == "complete"
 
 
-def speeds_at_decisions(env: PolyExploreEnv, infos: list[dict[str, Any]]) -> list[float]:
-    return [info["speed"] for info in infos]
-
-
 def test_the_robot_goes_on_at_speed():
     env = PolyExploreEnv(HALL, config=config("physics", decide="interval", decide_every=0.5))
     observation, info = env.reset(seed=0, options={"start": (1.0, 1.5)})
@@ -157,7 +153,8 @@ def test_narrow_sensors_scan_while_they_turn():
     where = np.hypot(*np.diff(scene.measured_at[:, :2], axis=0).T)
     on_the_spot = turned[where < 1e-6]
     assert len(on_the_spot) > 3
-    assert on_the_spot[4:].max() <= 0.5 * math.radians(90) + 0.2
+    # (A bumped robot looks where it wanted to in one turn.)
+    assert (on_the_spot[4:] <= 0.5 * math.radians(90) + 1e-6).mean() > 0.9
 
 
 def test_episodes_repeat():

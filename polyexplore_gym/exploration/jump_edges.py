@@ -60,6 +60,8 @@ class Opened(NamedTuple):
     """(c,) of its pieces, m"""
     width: np.ndarray
     """(c,) with the gaps between its pieces and on to the walls at its ends, m"""
+    room: np.ndarray
+    """(c,) twice the distance from walls of that place on it (of those tried) that has most, m; `tol.gap` at most"""
     middle: np.ndarray
     """(c, 2) point at half the length"""
     normal: np.ndarray
@@ -573,11 +575,48 @@ def _to_wall(x, y, walls, tol):
 
 
 @njit(cache=True)
+def _free(x, y, walls, most):
+    """Distance of a point from the nearest wall, `most` at most."""
+    best = most
+    for w in range(walls.shape[0]):
+        if (
+            min(walls[w, 0], walls[w, 2]) < x + best
+            and max(walls[w, 0], walls[w, 2]) > x - best
+            and min(walls[w, 1], walls[w, 3]) < y + best
+            and max(walls[w, 1], walls[w, 3]) > y - best
+        ):
+            best = min(best, point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]))
+    return best
+
+
+@njit(cache=True)
+def _room(segments, rows, walls, tol):
+    """How wide a disc that goes through a chain (rows in order) may be: see `Opened.room`."""
+    best = 0.0
+    step = 0.1 * tol.gap
+    x = segments[rows[0], 0]
+    y = segments[rows[0], 1]
+    for i in rows:
+        for share in range(2):  # the gap before a piece, and the piece
+            ex = segments[i, 2 * share]
+            ey = segments[i, 2 * share + 1]
+            parts = max(int(math.hypot(ex - x, ey - y) / step), 1)
+            for k in range(parts + 1):
+                f = k / parts
+                best = max(best, 2.0 * _free(x + f * (ex - x), y + f * (ey - y), walls, 0.5 * tol.gap))
+                if best >= tol.gap:
+                    return best
+            x = ex
+            y = ey
+    return best
+
+
+@njit(cache=True)
 def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
     """What there is to say of the chains in `order` and `offsets` (see `link`)."""
     c = offsets.size - 1
     out = Opened(
-        np.arange(next_id, next_id + c), np.zeros(c), np.zeros(c), np.empty((c, 2)), np.empty((c, 2)),
+        np.arange(next_id, next_id + c), np.zeros(c), np.zeros(c), np.zeros(c), np.empty((c, 2)), np.empty((c, 2)),
         np.empty((c, 4)), np.empty(c, np.int8), np.zeros(c, np.int64),
     )  # fmt: skip
     for q in range(c):
@@ -613,6 +652,7 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
             out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
             out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
         out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
+        out.room[q] = _room(segments, order[offsets[q] : offsets[q + 1]], walls, tol)
         run = 0.0
         out.middle[q, 0] = out.ends[q, 0]
         out.middle[q, 1] = out.ends[q, 1]

@@ -151,7 +151,7 @@ class Remains(NamedTuple):
 
 def _nothing() -> Opened:
     z, i = np.zeros(0), np.zeros(0, np.int64)
-    return Opened(i, z, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i)
+    return Opened(i, z, z, z, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 4)), i.astype(np.int8), i)
 
 
 _EVERYWHERE = np.array([-math.inf, -math.inf, math.inf, math.inf])
@@ -173,7 +173,9 @@ class ExplorationMap:
         self.sensor = sensor
         self.tol = tolerances(config, sensor, radius)
         self.least_width = self.tol.gap - 3.0 * sensor.sigma_range
-        """Openings narrower than this are no jump edges: the robot's diameter, less what noise may take off."""
+        """Openings narrower than this are no jump edges: the robot's diameter, less what noise may take off. Nor are
+        those along which a disc of this diameter fits nowhere between the walls: however long, as the way into a slit,
+        nobody can go through. What can be reached lies behind others too."""
         n = sensor.beams
         self.n_scans = 0
         """Scan polygons kept: those that showed something new."""
@@ -341,7 +343,7 @@ class ExplorationMap:
         alive[owner] = True  # the last one stands for pieces without a chain
         c = self.chains
         staying = alive[c.id]
-        wide = np.flatnonzero(new.width >= self.least_width)
+        wide = np.flatnonzero(np.minimum(new.width, new.room) >= self.least_width)
         gone = np.flatnonzero(~staying)
         again = jump_edges.unchanged(new, wide, gone, c.middle, c.ends)
         for q, row in zip(wide, again, strict=True):
@@ -524,7 +526,7 @@ class ExplorationMap:
         lost = jump_edges.summarise(
             p.segments[rows], p.kind[rows], p.visits[rows], np.arange(len(rows)), offsets, self._walls, 0, self.tol
         )
-        wide = lost.width >= self.least_width
+        wide = np.minimum(lost.width, lost.room) >= self.least_width
         return Remains(int(out.sum()), float(c.length[out].sum()), int(wide.sum()), float(lost.length[wide].sum()))
 
     def _way_out(self, x: float, y: float) -> list[tuple[float, float]]:

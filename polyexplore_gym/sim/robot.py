@@ -74,14 +74,18 @@ def walls_around(segments, path, pose, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def apart(path, shortest):  # type: ignore[no-untyped-def]
-    """Indices of the points of a path (k, 2) that are no nearer than this (m) to the one before that is kept."""
-    out, n = np.zeros(path.shape[0], np.int64), 1
-    for i in range(1, path.shape[0]):
-        if math.hypot(path[i, 0] - path[out[n - 1], 0], path[i, 1] - path[out[n - 1], 1]) >= shortest:
-            out[n] = i
+def apart(points, shortest):  # type: ignore[no-untyped-def]
+    """The points (k, 2) that are no nearer than this (m) to the one kept before, and their indices; none if any
+    coordinate is not finite."""
+    out, keep, n = np.empty_like(points), np.empty(points.shape[0], np.int64), 0
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return out[:0], keep[:0]
+        if n == 0 or math.hypot(x - out[n - 1, 0], y - out[n - 1, 1]) >= shortest:
+            out[n, 0], out[n, 1], keep[n] = x, y, i
             n += 1
-    return out[:n]
+    return out[:n], keep[:n]
 
 
 @njit(cache=True)
@@ -91,6 +95,13 @@ def way_length(trajectory):  # type: ignore[no-untyped-def]
     for i in range(1, trajectory.shape[0]):
         total += math.hypot(trajectory[i, 0] - trajectory[i - 1, 0], trajectory[i, 1] - trajectory[i - 1, 1])
     return total
+
+
+@njit(cache=True)
+def wrap_headings(trajectory):  # type: ignore[no-untyped-def]
+    """Wrap the headings (rad) of a trajectory (m, 3) to (-pi, pi], in place."""
+    for i in range(trajectory.shape[0]):
+        trajectory[i, 2] = math.pi - (math.pi - trajectory[i, 2]) % (2.0 * math.pi)
 
 
 @njit(cache=True)
@@ -330,13 +341,16 @@ def advance(distance, initial, allowed, time, speed, acceleration):  # type: ign
             return min(distance, time * (initial - 0.5 * acceleration * time)), time, 0.0, TIME
         return (allowed, spent, now, CUT) if allowed < distance else (distance, spent, 0.0, ARRIVED)
     whole, began = distance + before, initial / acceleration
-    covered = min(distance, max(0.0, profile_distance(time + began, whole, speed, acceleration) - before))
+    total = profile_time(whole, speed, acceleration)
+    covered = distance
+    if time + began < total:
+        covered = min(distance, max(0.0, profile_distance(time + began, whole, speed, acceleration) - before))
     if allowed < covered:
         spent, now = profile_moment(allowed + before, whole, speed, acceleration)
         return allowed, max(0.0, spent - began), now, CUT
     if covered < distance:
         return covered, time, 0.0, TIME
-    return distance, max(0.0, profile_time(whole, speed, acceleration) - began), 0.0, ARRIVED
+    return distance, max(0.0, total - began), 0.0, ARRIVED
 
 
 @njit(cache=True)
@@ -367,10 +381,10 @@ def glide(segments, pose, motion, path, heading, final_turn, radius, limits, tim
         if not last or final_turn:
             turn = ((heading if last else math.atan2(dy, dx)) - phi + math.pi) % (2.0 * math.pi) - math.pi
         if now > 0.0:
-            ahead = not last and abs(turn) < 0.5 * math.pi
-            if length <= _ROUNDING * radius or (ahead and length * abs(math.sin(turn)) <= _ROUNDING * radius):
+            aside = length * abs(math.sin(turn)) if abs(turn) < 0.5 * math.pi else length
+            if not last and aside <= _ROUNDING * radius:
                 turn = 0.0
-            elif ahead and abs(turn) <= _STRAIGHT_ON:
+            elif not last and abs(turn) <= _STRAIGHT_ON:
                 phi, turn_left, turn = phi + turn, turn_left - abs(turn), 0.0  # on the way
             else:
                 time, now = time + now / acceleration, 0.0

@@ -25,6 +25,7 @@ from polyexplore_gym.sim.robot import (
     nearest_wall,
     walls_around,
     way_length,
+    wrap_headings,
 )
 
 _PATH_START = 0.004
@@ -84,25 +85,26 @@ class _Cut:
 
     state: np.ndarray
     """As in `sim.follower`; in `kinematic` pose, speed and turn rate only."""
-    behind: np.ndarray
-    """(2,) m, where the leg began, or the end of the path where none is left."""
-    ahead: np.ndarray | None
-    """(2,) m, the next vertex, if any."""
+    behind: tuple[float, float]
+    """m, where the leg began, or the end of the path where none is left."""
+    ahead: tuple[float, float] | None
+    """m, the next vertex, if any."""
     time: float
     """Driven so far, s: the time limit holds for all the pieces of a drive together."""
 
     @classmethod
     def of(cls, state: np.ndarray, path: np.ndarray, vertex: int, time: float) -> _Cut:
         """From the path (k, 2) driven and the index in it of the next vertex."""
-        return cls(state, path[min(vertex, len(path)) - 1], path[vertex] if vertex < len(path) else None, time)
+        ahead = tuple(path[vertex].tolist()) if vertex < len(path) else None
+        return cls(state, tuple(path[min(vertex, len(path)) - 1].tolist()), ahead, time)
 
     def goes_on(self, path: np.ndarray, radius: float) -> bool:
         """Whether a path (k, 2) leads on to the same next vertex."""
         if self.ahead is None or len(path) == 1:
             return self.ahead is None and len(path) == 1
-        leg = math.hypot(self.ahead[0] - self.behind[0], self.ahead[1] - self.behind[1])
-        off = math.hypot(path[1, 0] - self.ahead[0], path[1, 1] - self.ahead[1])
-        return off <= min(_SAME * radius, _SAME_COURSE * leg)
+        x, y = path[1].tolist()
+        off = math.hypot(x - self.ahead[0], y - self.ahead[1])
+        return off <= _SAME * radius and off <= _SAME_COURSE * math.dist(self.ahead, self.behind)
 
 
 class World:
@@ -156,6 +158,7 @@ class World:
         self._walls = walls
         self._pose = start
         self._cut: _Cut | None = None
+        self._shortest_leg = _SHORTEST_LEG * robot.radius
         self._limits = (robot.max_speed, robot.max_turn_rate, robot.max_acceleration, robot.max_turn_acceleration)
 
     @property
@@ -226,18 +229,13 @@ class World:
 
     def _checked_path(self, path: np.ndarray) -> np.ndarray:
         points = np.array(path, dtype=np.float64, order="C")
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or len(apart(points, 0.0)[0]) < len(points):
             raise InvalidMotionError(f"path of shape {points.shape}: expected finite (k, 2), k >= 1")
-        if math.hypot(points[0, 0] - self._pose[0], points[0, 1] - self._pose[1]) > _PATH_START * self.robot.radius:
+        if math.dist(points[0].tolist(), self._pose[:2].tolist()) > _PATH_START * self.robot.radius:
             raise InvalidMotionError(
                 f"path starts at {points[0].tolist()}, the robot stands at {self._pose[:2].tolist()}"
             )
         return points
-
-    def _legs(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The path without legs that are too short, and the indices of its vertices in the one given."""
-        keep = apart(points, _SHORTEST_LEG * self.robot.radius)
-        return points if len(keep) == len(points) else points[keep], keep
 
     def _contact(self, collided: bool) -> float | None:
         """What a ring of bumpers feels: the bearing of the nearest wall in the robot frame."""
@@ -257,7 +255,7 @@ class World:
     def _glide(self, points: np.ndarray, heading: float, final_turn: bool, way: float, turn: float) -> DriveResult:
         drive = self._carried_on(points)
         before = drive.time if drive else 0.0
-        path, keep = self._legs(points)
+        path, keep = apart(points, self._shortest_leg)
         trajectory, distance, duration, ended, vertex, speed, rate = glide(
             self._walls,
             self._pose,
@@ -280,7 +278,7 @@ class World:
         robot, step, limits = self.robot, self.config.time_step, self._limits
         drive = self._carried_on(points)
         before = round(drive.time / step) if drive else 0
-        path, keep = self._legs(points)
+        path, keep = apart(points, self._shortest_leg)
         speeds = follower.vertex_speeds(path, limits, robot.radius, step)
         state = np.zeros(9)
         state[:3] = self._pose
@@ -296,7 +294,7 @@ class World:
             run.along(points[:1], speeds, 0.0, False)
             if state[follower.PHASE] == follower.DONE:
                 points[0] = state[:2]
-                path, keep = self._legs(points)
+                path, keep = apart(points, self._shortest_leg)
                 speeds = follower.vertex_speeds(path, limits, robot.radius, step)
                 state[follower.PHASE] = follower.entry(state, path, speeds, limits, robot.radius)
         run.along(path, speeds, heading, final_turn)
@@ -309,7 +307,7 @@ class World:
     def _end(
         self, trajectory: np.ndarray, distance: float, duration: float, ended: int, following: int, cut: _Cut | None
     ) -> DriveResult:
-        trajectory[:, 2] = math.pi - (math.pi - trajectory[:, 2]) % (2.0 * math.pi)
+        wrap_headings(trajectory)
         self._pose, self._cut = trajectory[-1].copy(), cut
         contact = self._contact(ended == BUMP)
         return DriveResult(trajectory, float(distance), float(duration), _ENDED[ended], following, contact)
@@ -337,8 +335,13 @@ class _Run:
         goes on as the original."""
 
     @property
+    def used_up(self) -> bool:
+        way, turn = self.left.tolist()
+        return way <= 0.0 or turn <= 0.0
+
+    @property
     def over(self) -> bool:
-        return self.done >= self.steps or self.state[follower.PHASE] >= follower.DONE or self.left.min() <= 0.0
+        return self.done >= self.steps or self.state[follower.PHASE] >= follower.DONE or self.used_up
 
     def along(self, path: np.ndarray, speeds: np.ndarray, heading: float, final_turn: bool) -> None:
         """Drive on until it is over."""
@@ -384,9 +387,9 @@ class _Run:
     def ended(self, end: np.ndarray) -> int:
         """Why it is over; end (2,) of the path, m."""
         state = self.state
-        away = math.hypot(state[follower.X] - end[0], state[follower.Y] - end[1]) > _ARRIVED * self.robot.radius
+        away = math.dist(state[:2].tolist(), end.tolist()) > _ARRIVED * self.robot.radius
         if state[follower.PHASE] == follower.DONE and not away:
             return ARRIVED
         if state[follower.PHASE] >= follower.DONE:
             return BUMP if state[follower.MET] > 0.0 else LOST
-        return CUT if self.left.min() <= 0.0 else TIME
+        return CUT if self.used_up else TIME

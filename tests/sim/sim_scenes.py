@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 
@@ -53,6 +54,15 @@ def any_robot(rng: np.random.Generator) -> tuple[RobotConfig, float]:
         max_turn_acceleration=rate * draw(0.5, 200.0),
     )
     return robot, step
+
+
+def random_path(rng: np.random.Generator, shortest: float, longest: float) -> np.ndarray:
+    """From the origin, two to eight points: gentle and sharp turns, legs from shortest to longest (m)."""
+    points, heading = [np.zeros(2)], rng.uniform(-3, 3)
+    for _ in range(rng.integers(1, 8)):
+        points.append(points[-1] + rng.uniform(shortest, longest) * np.array([math.cos(heading), math.sin(heading)]))
+        heading += rng.normal(0, 0.3) if rng.random() < 0.5 else rng.uniform(-2.5, 2.5)
+    return np.array(points)
 
 
 def lines_of(walls: np.ndarray) -> shapely.Geometry:

@@ -4,21 +4,13 @@ import numpy as np
 import pymunk
 import pytest
 import shapely
-from sim_scenes import any_robot, boxed
+from sim_scenes import any_robot, boxed, random_path
 
 from polyexplore_gym.config import DriveConfig, RobotConfig, SensorConfig
 from polyexplore_gym.sim import follower
 from polyexplore_gym.sim.world import World
 
 NO_WALLS = np.empty((0, 4))
-
-
-def random_path(rng: np.random.Generator, shortest: float, longest: float) -> np.ndarray:
-    points, heading = [np.zeros(2)], rng.uniform(-3, 3)
-    for _ in range(rng.integers(1, 8)):
-        points.append(points[-1] + rng.uniform(shortest, longest) * np.array([math.cos(heading), math.sin(heading)]))
-        heading += rng.normal(0, 0.3) if rng.random() < 0.5 else rng.uniform(-2.5, 2.5)
-    return np.array(points)
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
@@ -144,3 +136,34 @@ def test_vertex_speeds_leave_room_to_brake() -> None:
         assert (speeds[:-1] ** 2 <= speeds[1:] ** 2 + 2 * 0.6 * legs + 1e-9).all()
         assert (speeds[1:-1][turns > math.radians(45)] == 0.0).all()
         assert speeds.max() <= 1.2
+
+
+@pytest.mark.parametrize("step", [0.001, 0.04, 0.2])
+def test_stopping_distance_is_what_braking_takes(step: float) -> None:
+    limits = (1.2, 3.0, 0.6, 5.0)
+    change = 0.9 * 0.6 * step
+    for n in range(1, int(1.2 / change) + 1):  # from n changes of speed: a step at each
+        way = sum(k * change * step for k in range(1, n + 1))
+        assert follower.stopping_distance(n * change, limits, step) == pytest.approx(way)
+    for speed in np.linspace(0.0, 1.2, 100):
+        way = follower.stopping_distance(speed, limits, step)
+        assert follower._braking(way, 0.0, 0.9 * 0.6, step) == pytest.approx(speed)
+    assert follower.stopping_distance(1.2, limits, 0.0) == pytest.approx(1.2)
+
+
+def test_a_robot_that_moves_takes_up_what_leads_on() -> None:
+    limits, state = (1.2, 3.0, 0.6, 5.0), np.zeros(9)
+
+    def phase(speed: float, *points: tuple[float, float]) -> int:
+        state[follower.SPEED] = speed
+        path = np.array([(0.0, 0.0), *points])
+        return follower.entry(state, path, follower.vertex_speeds(path, limits, 0.25, 0.04), limits, 0.25)
+
+    assert phase(0.0) == follower.FINAL
+    assert phase(0.0, (3.0, 0.0)) == follower.ALIGN
+    assert phase(0.1) == follower.BRAKE
+    assert phase(1.2, (3.0, 0.0)) == phase(1.2, (3.0, 2.9)) == follower.FOLLOW
+    assert phase(1.2, (3.0, 3.1)) == phase(1.2, (-3.0, 0.0)) == follower.BRAKE
+    assert phase(1.2, (1.0, 0.0)) == phase(1.2, (0.5, 0.0), (5.0, 0.1)) == follower.FOLLOW
+    assert phase(1.2, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0)) == follower.BRAKE  # a stop that it would overshoot
+    assert phase(0.5, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0)) == follower.FOLLOW

@@ -6,15 +6,24 @@ import shapely
 from sim_scenes import clear_point, lines_of, random_walls
 
 from polyexplore_gym.sim.robot import (
+    ARRIVED,
+    CUT,
     STANDOFF,
+    TIME,
+    advance,
+    apart,
     bounded,
     first_contact,
+    glide,
     is_free,
     nearest_wall,
     profile_distance,
+    profile_moment,
     profile_time,
+    walls_around,
     walls_near,
     way_length,
+    wrap_headings,
 )
 
 pytestmark = pytest.mark.bounds
@@ -121,6 +130,101 @@ def test_profile_is_the_integral_of_its_trapezoid(distance: float, speed: float,
     got = [profile_distance(t, distance, speed, acceleration) for t in times[::1000]]
     np.testing.assert_allclose(got, way[::1000], atol=1e-6)
     assert way[-1] == pytest.approx(distance, abs=1e-6)
+
+
+@pytest.mark.parametrize("distance", [4.0, 2.4, 0.5, 0.01])
+def test_profile_moment_is_when_so_much_is_covered(distance: float) -> None:
+    for share in np.linspace(0.0, 1.0, 101):
+        time, speed = profile_moment(share * distance, distance, 1.2, 0.6)
+        assert profile_distance(time, distance, 1.2, 0.6) == pytest.approx(share * distance, abs=1e-12)
+        ahead = profile_distance(time + 1e-6, distance, 1.2, 0.6) - profile_distance(time - 1e-6, distance, 1.2, 0.6)
+        if 0.001 < share < 0.999:
+            assert speed == pytest.approx(ahead / 2e-6, abs=2e-6)
+    assert profile_moment(distance, distance, 1.2, 0.6) == (profile_time(distance, 1.2, 0.6), 0.0)
+
+
+def driven(distance: float, initial: float, allowed: float, time: float) -> tuple[float, float, float]:
+    """(covered, time, speed) by small steps: full throttle, until it must brake; then what is left of the braking."""
+    step, at, speed, spent = 1e-4, 0.0, initial, 0.0
+    while at < min(distance, allowed) and spent < time and (speed > 0.0 or at == 0.0):
+        brake = speed * speed / 1.2 >= distance - at
+        after = max(speed - 0.6 * step, 0.0) if brake else min(speed + 0.6 * step, 1.2)
+        at, speed, spent = at + 0.5 * (speed + after) * step, after, spent + step
+    if at >= distance - 1e-6 and allowed >= distance:
+        spent, speed = min(spent + speed / 0.6, time), 0.0
+    return min(at, distance), spent, speed
+
+
+def test_advance_is_driving_by_small_steps() -> None:
+    rng, counts = np.random.default_rng(5), {ARRIVED: 0, CUT: 0, TIME: 0}
+    for _ in range(60):
+        distance, initial = rng.uniform(0.01, 3.0), rng.choice([0.0, rng.uniform(0.0, 1.2)])
+        allowed = rng.choice([np.inf, distance * rng.uniform(0.01, 1.2)])
+        limit = rng.choice([1e3, rng.uniform(0.1, 3.0)])
+        covered, time, speed, ended = advance(distance, initial, allowed, limit, 1.2, 0.6)
+        counts[ended] += 1
+        twin = driven(distance, initial, allowed, limit)
+        assert covered == pytest.approx(twin[0], abs=5e-4)
+        assert time == pytest.approx(twin[1], abs=5e-3 if covered < 0.99 * distance else 3e-2)
+        if ended == CUT:
+            assert speed == pytest.approx(twin[2], abs=1e-2)
+            assert covered == allowed
+        else:
+            assert speed == 0.0
+        assert (ended == TIME) == (time == limit and (covered < distance or initial**2 / 1.2 > distance))
+    assert min(counts.values()) > 8
+
+
+def glided(
+    speed: float, rate: float, *points: tuple[float, float], heading: float | None = None
+) -> tuple[float, float]:
+    """(duration, distance) of a glide without walls from the origin, along x."""
+    path, final = np.array([(0.0, 0.0), *points]), heading is not None
+    limits, left = (1.2, 3.0, 0.6, 5.0), (np.inf, np.inf)
+    result = glide(np.empty((0, 4)), np.zeros(3), (speed, rate), path, heading or 0.0, final, 0.25, limits, 1e3, left)
+    assert result[3] == ARRIVED
+    assert result[5:] == (0.0, 0.0)
+    return result[2], result[1]
+
+
+def test_a_glide_goes_on_at_speed_only_where_its_path_does() -> None:
+    rest = glided(0.0, 0.0, (3.0, 0.0))[0]
+    on = glided(0.6, 0.0, (3.0, 0.0))[0]
+    assert on == pytest.approx(profile_time(3.3, 1.2, 0.6) - 1.0)  # 0.3 m and 1 s to reach 0.6 m/s lie behind it
+    assert glided(0.6, 0.0, (3.0 * math.cos(0.015), 3.0 * math.sin(0.015)))[0] == pytest.approx(on)
+    turn = profile_time(1.0, 3.0, 5.0)
+    assert glided(0.6, 0.0, (3.0 * math.cos(1.0), 3.0 * math.sin(1.0)))[0] == pytest.approx(1.0 + turn + rest)
+    assert glided(0.6, 0.0) == (1.0, 0.0)
+    assert glided(0.6, 0.0, (0.1, 0.0)) == (pytest.approx(1.0), pytest.approx(0.1))  # too short to brake on
+    # turning: 0.1 rad and 0.2 s to reach 1 rad/s lie behind it
+    assert glided(0.0, 1.0, heading=1.0)[0] == pytest.approx(profile_time(1.1, 3.0, 5.0) - 0.2)
+    assert glided(0.0, -1.0, heading=1.0)[0] == pytest.approx(0.2 + turn)
+    assert glided(0.0, 1.0)[0] == pytest.approx(0.2)
+
+
+def test_points_apart_and_headings_wrapped() -> None:
+    points = np.array([[0.0, 0.0], [0.001, 0.0], [0.5, 0.0], [0.5, 0.0], [0.5, 1.0]])
+    kept, index = apart(points, 0.01)
+    np.testing.assert_array_equal(index, [0, 2, 4])
+    np.testing.assert_array_equal(kept, points[index])
+    for bad in (np.nan, np.inf):
+        assert len(apart(np.array([[0.0, 0.0], [1.0, bad]]), 0.01)[0]) == 0
+    way = np.random.default_rng(6).normal(0.0, 8.0, (500, 3))
+    headings = way[:, 2].copy()
+    wrap_headings(way)
+    assert (np.abs(way[:, 2]) <= math.pi).all()
+    np.testing.assert_allclose(np.exp(1j * way[:, 2]), np.exp(1j * headings), atol=1e-12)
+
+
+def test_walls_around_a_path_are_those_in_its_box() -> None:
+    rng = np.random.default_rng(7)
+    walls = random_walls(rng, 200)
+    for _ in range(20):
+        path, pose = rng.uniform(-4, 4, (3, 2)), rng.uniform(-4, 4, 3)
+        box, near = walls_around(walls, path, pose, 0.7)
+        bounds = shapely.MultiPoint(np.vstack([path, pose[:2]])).bounds
+        np.testing.assert_allclose(box, np.add(bounds, [-0.7, -0.7, 0.7, 0.7]))
+        np.testing.assert_array_equal(near, walls[walls_near(walls, *box)])
 
 
 def test_walls_near_and_way_length() -> None:
