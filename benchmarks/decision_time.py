@@ -1,6 +1,7 @@
 """What does a decision of each policy cost, by the number of nodes to choose from?
 
-    python benchmarks/decision_time.py [--plans FILE ...] [--repeat 3] [--policies NAME ...]
+    python benchmarks/decision_time.py [--plans FILE ...] [--repeat 3] [--policies NAME ...] [--sensing moving]
+                                       [--scan-every 0.5]
 
 Explores plans with `nearest` (nodes in front of the jump edges, kinematic drive) and asks every policy at every state
 what it would do, in turns, on one thread: the observation has 64 nodes at most. One row a policy: milliseconds, the
@@ -19,6 +20,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import sensing
 from plan_statistics import default_folder
 from tqdm import tqdm
 
@@ -35,9 +37,10 @@ NODES = (1, 9, 17, 33, 64)
 """Groups of states by their reachable nodes: from one of these to less than the next; the last is the most of all."""
 
 
-def milliseconds(plan: FloorPlan, policies: dict[str, Policy], repeat: int) -> tuple[np.ndarray, np.ndarray]:
+def milliseconds(
+    plan: FloorPlan, policies: dict[str, Policy], repeat: int, config: EnvConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Reachable nodes (n,) at each decision of an exploration, and what each policy's choice costs (n, p), ms."""
-    config = EnvConfig(drive=DriveConfig(mode="kinematic"), exploration=ExplorationConfig(placement="in_front"))
     env = PolyExploreEnv(config=config)
     seen, info = env.reset(seed=0, options={"plan": plan})
     counts: list[int] = []
@@ -67,13 +70,16 @@ def main() -> None:
     parser.add_argument("--plans", type=Path, nargs="+", help="plan JSON files")
     parser.add_argument("--repeat", type=int, default=3, help="calls a state, of which the fastest counts")
     parser.add_argument("--policies", nargs="+", default=["nearest", *LOOK_AHEAD, "learned"])
+    sensing.add_options(parser)
     options = parser.parse_args()
+    config = EnvConfig(drive=DriveConfig(mode="kinematic"), exploration=ExplorationConfig(placement="in_front"))
+    config = sensing.sensing_so(config, options.sensing, options.scan_every)
     files = options.plans or [file for name in PLANS if (file := default_folder() / name).is_file()]
     plans = [load_plan(file) for file in files] or [suite("office-test").plan(i) for i in (6, 7)]
     policies = {name: load_policy(spec) for name, spec in name_policies(options.policies).items()}
     print(f"plans: {', '.join(plan.name for plan in plans)}", flush=True)
-    milliseconds(suite("home-test").plan(0), policies, 1)  # compiles
-    measured = [milliseconds(plan, policies, options.repeat) for plan in plans]
+    milliseconds(suite("home-test").plan(0), policies, 1, config)  # compiles
+    measured = [milliseconds(plan, policies, options.repeat, config) for plan in plans]
     counts, took = (np.concatenate(part) for part in zip(*measured, strict=True))
     groups = [(a, b - 1) for a, b in itertools.pairwise(NODES)] + [(NODES[-1], NODES[-1])]
     groups = [(a, b) for a, b in groups if ((counts >= a) & (counts <= b)).any()]

@@ -1,14 +1,16 @@
-"""Which criterion drives least, and does it depend on sensor, noise, pose error or placement? A factorial study.
+"""Which criterion drives least, and does it depend on sensor, noise, pose error, placement or when it senses?
 
-    python benchmarks/factorial.py [--plans FOLDER] [--largest 1000] [--first N] [--workers 2] [--out results/factorial]
+    python benchmarks/factorial.py [--plans FOLDER] [--largest 1000] [--first N] [--sensing stops moving]
+                                   [--scan-every 0.5] [--workers 2] [--out results/factorial]
                                    [--figure docs/factorial.png]
 
 Factors: field of view (180, 360 degrees), maximum range (8, 30 m), laser noise (1, 5 times 0.01 m and 0.1 degrees),
-pose (exact, gaussian, odometry, slam), all criteria and both placements. Every plan meets each pose model once and
-each level of the other three twice: half of their 2 x 2 x 2 combinations, such that no two of the factors go together,
-with the pose models dealt out at random. On a plan all criteria and placements meet the same start and noise. Plans are
-those that `polyexplore bench` plays and, where they are, the shared ones. The drive is kinematic. Odometry that nothing
-corrects is played on plans of at most 300 m2 only: on larger ones the map falls apart before it is complete.
+pose (exact, gaussian, odometry, slam), all criteria, both placements, and scans and decisions at stops or on the way
+(`--sensing`). Every plan meets each pose model once and each level of the first three twice: half of their 2 x 2 x 2
+combinations, such that no two of the factors go together, with the pose models dealt out at random. On a plan all
+criteria, placements and ways to sense meet the same start and noise. Plans are those that `polyexplore bench` plays
+and, where they are, the shared ones. The drive is kinematic. Odometry that nothing corrects is played on plans of at
+most 300 m2 only: on larger ones the map falls apart before it is complete.
 
 Tables: the effect of each factor on the distance of `nearest` (least squares on log distances with a mean for each
 plan, errors clustered by building); the ratios between criteria at each level of each factor, by family and by size,
@@ -33,11 +35,12 @@ from pathlib import Path
 
 import numpy as np
 import scipy.stats
+import sensing
 from plan_statistics import default_folder
 
 from polyexplore_gym.cli import BENCH_PLANS
 from polyexplore_gym.config import DriveConfig, EnvConfig, PoseConfig, SensorConfig
-from polyexplore_gym.evaluation import EpisodeRecord, Study, evaluate, name_policies
+from polyexplore_gym.evaluation import EpisodeRecord, Setting, Study, evaluate, name_policies
 from polyexplore_gym.evaluation.statistics import Interval, bootstrap_interval, geometric_mean
 from polyexplore_gym.evaluation.summary import finished
 from polyexplore_gym.evaluation.tables import format_table
@@ -89,7 +92,7 @@ class Condition:
             sigma_angle=math.radians(0.1) * noise,
         )
         pose = PoseConfig(mode=self.pose)  # type: ignore[arg-type]
-        return EnvConfig(sensor=sensor, pose=pose, drive=DriveConfig(mode="kinematic"), max_decisions=500)
+        return EnvConfig(sensor=sensor, pose=pose, drive=DriveConfig(mode="kinematic"), max_decisions=1000)
 
 
 @dataclass(frozen=True)
@@ -115,18 +118,28 @@ def deal(plans: Sequence[FloorPlan], rng: np.random.Generator) -> dict[Condition
     return dealt
 
 
-def play(
-    dealt: Mapping[Condition, Sequence[FloorPlan]], policies: Sequence[str], workers: int, out: Path, shared: set[str]
-) -> list[Run]:
+def play(dealt: Mapping[Condition, Sequence[FloorPlan]], options: argparse.Namespace, shared: set[str]) -> list[Run]:
     """All episodes, those of each condition in a folder of its own."""
+    out = options.out / sensing.folder_name(options.sensing, options.scan_every)
     runs: list[Run] = []
     for k, (condition, plans) in enumerate(sorted(dealt.items(), key=lambda item: item[0].name), 1):
         print(f"{k}/{len(dealt)} {condition.name}: {len(plans)} plans", flush=True)
-        study = Study(policies=name_policies(policies), plans=plans, placements=PLACEMENTS, config=condition.config())
+        study = Study(
+            policies=name_policies(options.policies),
+            plans=plans,
+            placements=PLACEMENTS,
+            sensing=options.sensing,
+            config=sensing.scanning(condition.config(), options.scan_every),
+        )
         areas = {plan.content_hash: plan.area for plan in plans}
-        records = evaluate(study, out=out / condition.name, workers=workers)
+        records = evaluate(study, out=out / condition.name, workers=options.workers)
         runs += [Run(r, condition, areas[r.plan_hash], r.plan_hash in shared) for r in records]
     return runs
+
+
+def within(runs: Sequence[Run]) -> dict[str, tuple[str, ...]]:
+    """The factors of which every plan meets every level: fields of the record."""
+    return {factor: tuple(dict.fromkeys(getattr(r.record, factor) for r in runs)) for factor in Setting._fields}
 
 
 def groups(runs: Sequence[Run]) -> dict[str, dict[str, list[Run]]]:
@@ -134,7 +147,8 @@ def groups(runs: Sequence[Run]) -> dict[str, dict[str, list[Run]]]:
     found: dict[str, dict[str, list[Run]]] = {"": {"all": list(runs)}}
     for factor, levels in FACTORS.items():
         found[factor] = {level: [r for r in runs if r.condition.levels[factor] == level] for level in levels}
-    found["placement"] = {p: [r for r in runs if r.record.placement == p] for p in PLACEMENTS}
+    for factor, levels in within(runs).items():
+        found[factor] = {level: [r for r in runs if getattr(r.record, factor) == level] for level in levels}
     families = {r.record.stratum for r in runs if not r.shared}
     found["plans"] = {
         f"generated: {f}": [r for r in runs if not r.shared and r.record.stratum == f] for f in sorted(families)
@@ -163,7 +177,7 @@ def comparable(runs: Sequence[Run]) -> list[Run]:
 
 def ratio(runs: Sequence[Run], ours: str, theirs: str, rng: np.random.Generator) -> tuple[Interval, int] | None:
     """Geometric mean of our distance over theirs where both are comparable, and the number of pairs."""
-    known = {(r.record.policy, r.record.placement, r.record.plan_hash, r.condition): r for r in runs}
+    known = {(r.record.policy, r.record.setting, r.record.plan_hash, r.condition): r for r in runs}
     pairs = [(r, known[theirs, *key[1:]]) for key, r in known.items() if key[0] == ours and (theirs, *key[1:]) in known]
     pairs = [(a, b) for a, b in pairs if a.record.distance > 0 and b.record.distance > 0]
     if not pairs:
@@ -180,9 +194,9 @@ def effects(runs: Sequence[Run], *, confidence: float = 0.95) -> list[tuple[str,
     Liang and Zeger 1986 with buildings as clusters, and Student's t with buildings less one degrees.
     """
     runs = [r for r in runs if r.record.distance > 0]
-    factors = {**FACTORS, "placement": PLACEMENTS}
+    factors = {**FACTORS, **within(runs)}
     columns = [(factor, level) for factor, levels in factors.items() for level in levels[1:]]
-    levels = [{**r.condition.levels, "placement": r.record.placement} for r in runs]
+    levels = [{**r.condition.levels, **r.record.setting._asdict()} for r in runs]
     x = np.array([[float(of[factor] == level) for factor, level in columns] for of in levels])
     y = np.log([r.record.distance for r in runs])
     plans = np.unique([r.record.plan_hash for r in runs], return_inverse=True)[1]
@@ -263,6 +277,7 @@ def main() -> None:
     parser.add_argument("--largest", type=float, default=1000.0, help="only real plans of at most so many m2")
     parser.add_argument("--first", type=int, help="only the first so many plans of each kind")
     parser.add_argument("--policies", nargs="+", default=list(POLICIES), help="criteria")
+    sensing.add_options(parser, default=["stops", "moving"])
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, default=Path("results/factorial"), help="folder of the results")
     parser.add_argument("--figure", type=Path, help="file of the figure (default: factorial.png in the folder)")
@@ -273,7 +288,7 @@ def main() -> None:
     if not real:
         print(f"no plans in {options.plans}: generated plans only (--plans names another folder)")
     dealt = deal([*real, *drawn], np.random.default_rng(0))
-    runs = play(dealt, options.policies, options.workers, options.out, {plan.content_hash for plan in real})
+    runs = play(dealt, options, {plan.content_hash for plan in real})
 
     header = ("factor", "level", "episodes", "failed", "cut off", "seen %, median", "5 %", "least", "compared %")
     print(f"\n{format_table(header, ended_rows(runs), 'markdown')}\n")

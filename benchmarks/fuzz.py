@@ -6,9 +6,9 @@
     python benchmarks/fuzz.py --scaled [--first 0] [--count 50]
 
 A case draws a robot of 0.05 to 1 m, a sensor (1 to 200 m, 20 to 2,000 beams, 30 to 360 degrees, up to ten times the
-noise), both placements and drives, all pose modes, scans on the way or not, looking around or not, a criterion, and
-a plan in units of the robot: generated ones scaled so that their doors fit, and degenerate ones (`PLANS`). It is
-played in a child process, which is started anew after a crash, with a limit of CPU time.
+noise), both placements and drives, all pose modes, scans and decisions on the way or not, looking around or not, a
+criterion, and a plan in units of the robot: generated ones scaled so that their doors fit, and degenerate ones
+(`PLANS`). It is played in a child process, which is started anew after a crash, with a limit of CPU time.
 
 Findings: a crash (the process died), an exception, a hang (the CPU limit), a truncated episode, and an episode that
 ended although a place within reach would show more floor that no scan saw than `exact.py` allows. With the pose from
@@ -61,6 +61,8 @@ CPU_LIMIT = 60.0
 """CPU time of a case, s, and so much more for every 200 squares of the radius of its plan."""
 DECISIONS = 2000
 """Decisions of a case, or one for every 20 squares of the radius: then it is truncated, a finding."""
+ON_THE_WAY = 5
+"""So many times as many where they are made on the way."""
 CRITERIA = ("nearest", "nearest", "nearest", "largest", "ekman_ratio", "modified_sum", "utility", "random")
 DOOR_OF_GENERATED = 0.3
 """Generated plans are connected for a disc of this radius, m."""
@@ -303,6 +305,7 @@ def plan_of(family: str, rng: np.random.Generator, radius: float, reach: float, 
 def case_of(number: int) -> Case:
     """The case with a number, always the same."""
     rng = np.random.default_rng([17, number])
+    later = rng.spawn(1)[0]  # of its own, so that what came to be drawn later leaves the cases as they were
     radius = float(np.exp(rng.uniform(math.log(0.05), 0.0)))
     reach = float(np.clip(np.exp(rng.uniform(math.log(4.0), math.log(200.0))) * radius, max(1.0, 4.0 * radius), 200.0))
     family = str(rng.choice([*FAMILIES, *FAMILIES, *PLANS]))
@@ -332,8 +335,19 @@ def case_of(number: int) -> Case:
     plan = plan_of(family, rng, radius, reach, f"case-{number}-{family.replace(' ', '-')}")
     values["max_decisions"] = max(DECISIONS, int(plan.area / radius**2 / 20.0))
     start = _against_a_wall(rng, plan, radius) if rng.random() < 0.1 else None
+    values["exploration"] |= _on_the_way(later, radius, values["exploration"]["scan_every"])
+    if values["exploration"]["decide"] != "arrival":
+        values["max_decisions"] *= ON_THE_WAY
     return Case(number=number, family=family, plan=plan, values=values, criterion=str(rng.choice(CRITERIA)),
                 start=start)  # fmt: skip
+
+
+def _on_the_way(rng: np.random.Generator, radius: float, every: float) -> dict[str, Any]:
+    """When the next node is chosen, in every other case on the way; that takes scans there."""
+    decide = str(rng.choice(["arrival", "arrival", "settled", "interval"]))
+    scans = max(0.01, float(np.exp(rng.uniform(math.log(0.3), math.log(8.0)))) * radius)
+    interval = float(np.exp(rng.uniform(0.0, math.log(20.0)))) * radius
+    return {"decide": decide, "decide_every": interval, "scan_every": every or (scans if decide != "arrival" else 0.0)}
 
 
 def _against_a_wall(rng: np.random.Generator, plan: FloorPlan, radius: float) -> list[float] | None:
@@ -406,7 +420,8 @@ def describe(case: Case) -> dict[str, Any]:
         "pose": case.values["pose"]["mode"], "placement": exploration["placement"],
         "front/r": round((exploration["front_distance"] or 4.0 * radius) / radius, 1),
         "look_around": exploration["look_around"],
-        "every/r": round(exploration["scan_every"] / radius, 2), "criterion": case.criterion,
+        "every/r": round(exploration["scan_every"] / radius, 2), "decide": exploration["decide"],
+        "interval/r": round(exploration["decide_every"] / radius, 2), "criterion": case.criterion,
         "start": "wall" if case.start else "",
     }  # fmt: skip
 
@@ -419,6 +434,7 @@ LENGTHS = {
     ("pose", "drift_distance"): 0.5, ("pose", "drift_heading"): -0.5, ("pose", "correct_every"): 1.0,
     ("mapping", "min_length"): 1.0, ("mapping", "door_width"): 1.0, ("mapping", "range_floor"): 1.0,
     ("exploration", "front_distance"): 1.0, ("exploration", "min_gap"): 1.0, ("exploration", "scan_every"): 1.0,
+    ("exploration", "decide_every"): 1.0,
 }  # fmt: skip
 """Configured values that hold a length, and its power."""
 

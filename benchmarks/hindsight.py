@@ -1,6 +1,7 @@
 """How much could any one choice gain? The best next node, found by playing each to the end in the real building.
 
-    python benchmarks/hindsight.py [--plans FOLDER] [--largest 200] [--first N] [--tried 8] [--workers 2]
+    python benchmarks/hindsight.py [--plans FOLDER] [--largest 200] [--first N] [--tried 8] [--sensing moving]
+                                   [--scan-every 0.5] [--workers 2]
 
 Whoever chooses here knows the future, with its noise: at each decision up to so many nodes (that of the base policy and
 the nearest others) are played to the end in copies of the environment that follow the base policy, and the one with
@@ -21,6 +22,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import sensing
 from joblib import Parallel, delayed
 from look_ahead import plan_sets, text
 from plan_statistics import default_folder
@@ -46,9 +48,8 @@ FEWEST = 3
 BASES: dict[str, Choose] = {"nearest": nearest, "tour": tour}  # type: ignore[dict-item]
 
 
-def drive(plan: FloorPlan, base: str, tried: int) -> float:
+def drive(plan: FloorPlan, base: str, tried: int, config: EnvConfig) -> float:
     """Metres to a complete map, from the start with seed 0; `tried` 1: the base policy itself."""
-    config = EnvConfig(drive=DriveConfig(mode="kinematic"), exploration=ExplorationConfig(placement="in_front"))
     env = PolyExploreEnv(config=config)
     seen, info = env.reset(seed=0, options={"plan": plan})
     over = not seen["action_mask"].any()
@@ -70,6 +71,7 @@ def main() -> None:
     parser.add_argument("--largest", type=float, default=200.0, help="only plans of at most so many m2")
     parser.add_argument("--first", type=int, help="only the first so many plans of each set")
     parser.add_argument("--tried", type=int, default=8, help="nodes played to the end at a decision")
+    sensing.add_options(parser)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     options = parser.parse_args()
     sets = {
@@ -78,9 +80,11 @@ def main() -> None:
     }
     sets = {name: plans for name, plans in sets.items() if len(plans) >= FEWEST}
     runs = [("nearest", 1), ("tour", 1), ("nearest", options.tried), ("tour", options.tried)]
+    config = EnvConfig(drive=DriveConfig(mode="kinematic"), exploration=ExplorationConfig(placement="in_front"))
+    config = sensing.sensing_so(config, options.sensing, options.scan_every)
     tasks = [(name, plan, *run) for name, plans in sets.items() for plan in plans for run in runs]
     parallel = Parallel(n_jobs=options.workers, return_as="generator", batch_size=1)
-    driven = list(tqdm(parallel(delayed(drive)(*task[1:]) for task in tasks), total=len(tasks), unit="run"))
+    driven = list(tqdm(parallel(delayed(drive)(*task[1:], config) for task in tasks), total=len(tasks), unit="run"))
     table = []
     for name, plans in sets.items():
         ways = {

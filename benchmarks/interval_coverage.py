@@ -128,8 +128,8 @@ class Resampled:
         policies = list(dict.fromkeys(r.policy for r in done))
         theirs_name = "nearest" if "nearest" in policies else policies[0]
         ours_name = next(p for p in policies if p != theirs_name)
-        placement = done[0].placement
-        found = {(r.policy, r.plan_hash, r.seed): r for r in done if r.placement == placement and r.distance > 0}
+        setting = done[0].setting
+        found = {(r.policy, *r.pair): r for r in done if r.setting == setting and r.distance > 0}
         pairs = [
             (found[ours_name, *key[1:]], r)
             for key, r in found.items()

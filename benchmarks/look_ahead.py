@@ -1,13 +1,15 @@
 """What does looking ahead gain? Tours, roll-outs and learned selectors against the nearest node.
 
     python benchmarks/look_ahead.py [--models MODEL ...] [--plans FOLDER] [--largest N] [--first N] [--seeds 1]
-                                    [--workers 2] [--out results/look_ahead]
+                                    [--sensing stops moving] [--scan-every 0.5] [--workers 2]
+                                    [--out results/look_ahead]
 
-Nodes in front of the jump edges, kinematic drive. One row a planner and set of plans: the suites for tests as
-`polyexplore bench` takes them, and the shared plans where there are any. Distance over that of `nearest` on the same
-start (geometric mean and ratio of the means) and probability of the shorter way, with 95 % intervals over buildings,
-over the starts that all planners finished; milliseconds a decision, mean and longest. With `--models`, selectors
-trained with different seeds, the last table says what the seed changes: mean over the models, Student's 95 % interval.
+Nodes in front of the jump edges, kinematic drive. One row a planner, set of plans and way to sense: the suites for
+tests as `polyexplore bench` takes them, and the shared plans where there are any. Distance over that of `nearest` on
+the same start (geometric mean and ratio of the means) and probability of the shorter way, with 95 % intervals over
+buildings, over the starts that all planners finished; milliseconds a decision, mean and longest. With `--models`,
+selectors trained with different seeds, the last table says what the seed changes: mean over the models, Student's 95 %
+interval.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout. A run that was stopped goes on where it was.
@@ -23,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.stats
+import sensing
 from plan_statistics import default_folder
 
 from baselines import make_policy
@@ -52,9 +55,9 @@ def rows(name: str, records: list[EpisodeRecord], rng: np.random.Generator) -> t
     cells, ratios = [], {}
     for c in compare(records, rng):
         own = [r for r in records if r.policy == c.ours[0]]
-        both = {r.key[2:] for r in own if r.ended} & {r.key[2:] for r in records if r.policy == "nearest"}
+        both = {r.pair for r in own if r.ended} & {r.pair for r in records if r.policy == "nearest"}
         means = [
-            statistics.fmean(r.distance for r in records if r.policy == policy and r.key[2:] in both)
+            statistics.fmean(r.distance for r in records if r.policy == policy and r.pair in both)
             for policy in (c.ours[0], "nearest")
         ]
         ratios[c.ours[0]] = c.ratio.estimate
@@ -72,6 +75,7 @@ def main() -> None:
     parser.add_argument("--largest", type=float, default=math.inf, help="only real plans of at most so many m2")
     parser.add_argument("--first", type=int, help="only the first so many plans of each set")
     parser.add_argument("--seeds", type=int, default=1, help="starts on each plan")
+    sensing.add_options(parser, default=["stops"])
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--out", type=Path, default=Path("results/look_ahead"), help="folder of the results")
     options = parser.parse_args()
@@ -86,12 +90,17 @@ def main() -> None:
             policies=policies,
             plans=plans,
             placements=("in_front",),
+            sensing=options.sensing,
             seeds=range(options.seeds),
-            config=EnvConfig(drive=DriveConfig(mode="kinematic")),
+            config=sensing.scanning(EnvConfig(drive=DriveConfig(mode="kinematic")), options.scan_every),
         )
-        records = evaluate(study, out=options.out / name.replace(" ", "-"), workers=options.workers)
-        cells, found[name] = rows(name, records, np.random.default_rng(0))
-        table += cells
+        folder = f"{name.replace(' ', '-')}-{sensing.folder_name(options.sensing, options.scan_every)}"
+        records = evaluate(study, out=options.out / folder, workers=options.workers)
+        for way in options.sensing:
+            label = name if way == "stops" else f"{name}, {way}"
+            some = [r for r in records if r.sensing == way]
+            cells, found[label] = rows(label, some, np.random.default_rng(0))
+            table += cells
     header = ("plans", "planner", "starts", "distance / nearest", "of the means", "P(shorter)", "least seen %", "ms",
               "longest")  # fmt: skip
     print(f"\n{format_table(header, table, 'markdown')}")

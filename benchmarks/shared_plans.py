@@ -1,13 +1,15 @@
 """Does every exploration end by itself? All scripted criteria on all shared plans, through the evaluation library.
 
-    python benchmarks/shared_plans.py [--policies nearest ...] [--placement midpoint in_front] [--drive physics]
-                                      [--noise 1] [--exact] [--first N] [--workers 2] [--out results/shared_plans]
+    python benchmarks/shared_plans.py [--policies nearest ...] [--placement midpoint in_front] [--sensing stops moving]
+                                      [--scan-every 0.5] [--drive physics] [--noise 1] [--exact] [--first N]
+                                      [--workers 2] [--out results/shared_plans]
 
-One row a criterion and placement: episodes that ended by themselves, exceptions, truncations, median and smallest
+One row a criterion and setting: episodes that ended by themselves, exceptions, truncations, median and smallest
 coverage (share of the free area seen, with the plan), the smallest clearance of the robot's disc from the true walls
-where it stood to measure and anywhere on the way (below 0: overlap), bumps a decision, and with `--exact` the most
-floor that one place within reach would still show (`exact.py`). `--noise` scales the laser's noise of range and angle.
-A run that was stopped goes on where it was with the same arguments.
+where it measured and anywhere on the way (below 0: overlap), the way driven in all, bumps an episode, drives that ended
+since no path was left, by the time limit or off the path, and with `--exact` the most floor that one place within reach
+would still show (`exact.py`). `--noise` scales the laser's noise of range and angle. A run that was stopped goes on
+where it was with the same arguments.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout.
@@ -16,6 +18,7 @@ beside the checkout.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import statistics
@@ -27,6 +30,7 @@ from typing import Any
 import exact
 import gymnasium
 import numpy as np
+import sensing
 import shapely
 from plan_statistics import default_folder
 
@@ -78,7 +82,7 @@ class Watched(gymnasium.Wrapper):
 
 @dataclass(frozen=True)
 class MakeWatched:
-    """Makes the environment for the evaluation; a folder is of one policy and placement."""
+    """Makes the environment for the evaluation; a folder is of one policy and setting."""
 
     folder: Path
     exact: bool
@@ -114,24 +118,25 @@ def read_clearances(folder: Path) -> dict[Key, tuple[float, float, float]]:
 
 
 def row(records: Sequence[EpisodeRecord], clearances: dict[Key, tuple[float, float, float]]) -> list[str]:
-    """The figures of one policy and placement."""
+    """The figures of one policy and setting."""
     played = [r for r in records if r.status != "failed"]
     ended = [r for r in records if r.ended]
-    cells = [records[0].policy, records[0].placement, f"{len(ended)}/{len(records)}",
+    cells = [records[0].policy, str(records[0].setting), f"{len(ended)}/{len(records)}",
              f"{sum(not r.complete for r in ended)}", f"{len(records) - len(played)}",
              f"{sum(r.status == 'truncated' for r in records)}"]  # fmt: skip
     if not played:
-        return [*cells, "-", "-", "-", "-", "-", "-"]
+        return [*cells, *["-"] * 8]
     least = min(played, key=lambda r: r.coverage)
-    standing, moving, left = zip(*(clearances[r.plan_hash, r.seed] for r in played), strict=True)
-    decisions = sum(r.decisions for r in played)
+    standing, moving, left = zip(*(clearances[r.pair] for r in played), strict=True)
     return [
         *cells,
         f"{100 * statistics.median(r.coverage for r in played):.2f}",
         f"{100 * least.coverage:.2f} ({least.plan})",
         f"{1e3 * min(standing):.2f}",
         f"{1e3 * min(moving):.2f} ({played[moving.index(min(moving))].plan})",
-        f"{sum(r.collisions for r in played) / max(decisions, 1):.3f}",
+        f"{sum(r.distance for r in played) / 1e3:.2f}",
+        f"{statistics.fmean(r.collisions for r in played):.2f}",
+        ", ".join(f"{sum(r.ends.get(end, 0) for r in played)}" for end in ("blocked", "time", "lost")),
         f"{max(left):.2f} ({played[left.index(max(left))].plan})",
     ]
 
@@ -140,6 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policies", nargs="+", default=list(SCRIPTED), help="criteria")
     parser.add_argument("--placement", nargs="+", choices=("midpoint", "in_front"), default=["midpoint", "in_front"])
+    sensing.add_options(parser, default=["stops"])
     parser.add_argument("--drive", choices=("physics", "kinematic"), default="physics")
     parser.add_argument("--noise", type=float, default=1.0, help="factor of the laser's noise; 0 for none")
     parser.add_argument("--seeds", type=int, default=1, help="starts on each plan")
@@ -153,30 +159,30 @@ def main() -> None:
     if not plans:
         raise SystemExit(f"no plans in {options.plans}: name a folder with --plans")
     sensor = SensorConfig()
-    config = EnvConfig(
-        sensor=replace(
-            sensor, sigma_range=options.noise * sensor.sigma_range, sigma_angle=options.noise * sensor.sigma_angle
-        ),
-        drive=DriveConfig(mode=options.drive),
+    noisy = replace(
+        sensor, sigma_range=options.noise * sensor.sigma_range, sigma_angle=options.noise * sensor.sigma_angle
     )
+    config = sensing.scanning(EnvConfig(sensor=noisy, drive=DriveConfig(mode=options.drive)), options.scan_every)
     rows, failed = [], []
     # A folder for each set of arguments, so that one study never meets the files of another.
     out = options.out / f"{options.drive}-noise{options.noise:g}-{len(plans)}x{options.seeds}"
     for policy in options.policies:
-        for placement in options.placement:
-            study = Study(policies={policy: policy}, plans=plans, placements=[placement],
+        for placement, way in itertools.product(options.placement, options.sensing):
+            study = Study(policies={policy: policy}, plans=plans, placements=[placement], sensing=[way],
                           seeds=range(options.seeds), config=config)  # fmt: skip
-            folder = out / f"{policy.replace(':', '_')}-{placement}"
+            name = sensing.folder_name([way], options.scan_every)
+            folder = out / f"{policy.replace(':', '_')}-{placement}-{name}"
             records = evaluate(study, out=folder, workers=options.workers, make_env=MakeWatched(folder, options.exact))
             rows.append(row(records, read_clearances(folder)))
             failed += [r for r in records if not r.complete]
     print(f"\n{len(plans)} plans x {options.seeds} starts, {options.drive}, {options.noise:g} x the laser's noise:\n")
-    header = ("policy", "placement", "ended by itself", "with edges left", "exceptions", "truncated", "seen, median %",
-              "seen, least % (plan)", "clearance standing, least mm", "on the way, least mm (plan)",
-              "bumps a decision", "still to be seen from one place, most m2")  # fmt: skip
+    header = ("policy", "setting", "ended by itself", "with edges left", "exceptions", "truncated", "seen, median %",
+              "seen, least % (plan)", "clearance measuring, least mm", "on the way, least mm (plan)",
+              "driven, km", "bumps an episode", "blocked, time, lost",
+              "still to be seen from one place, most m2")  # fmt: skip
     print(format_table(header, rows, "markdown"))
     for r in failed:
-        print(f"\n{r.status}: {r.policy}, {r.placement}, {r.plan}, seed {r.seed}: "
+        print(f"\n{r.status}: {r.policy}, {r.setting}, {r.plan}, seed {r.seed}: "
               f"{r.error or f'{r.decisions} decisions, {100 * r.coverage:.1f} % seen'}")  # fmt: skip
 
 

@@ -1,11 +1,13 @@
 """Decisions a second on one core, where their time goes, the seconds of a 25-room episode, and memory.
 
-    python benchmarks/speed.py [--repetitions 3] [--only rate phases rooms memory] [--plans FOLDER]
+    python benchmarks/speed.py [--repetitions 3] [--only rate phases rooms memory] [--plans FOLDER] [--sensing moving]
+                               [--scan-every 0.5]
 
-Whole episodes with the policy `nearest` and the default configuration, from `reset()` on: plan and start, physics
-(or the kinematic drive), laser, maps, graph, observation, policy and coverage are all in the figure. A few decisions
-are played first, so that compiled kernels and the plan's own caches are warm. The process binds itself to one core.
-"wall" counts by the clock, "CPU" by the processor time used: the two differ when other programs want the core too.
+Whole episodes with the policy `nearest` and, but for `--sensing`, the default configuration, from `reset()` on: plan
+and start, physics (or the kinematic drive), laser, maps, graph, observation, policy and coverage are all in the figure.
+A few decisions are played first, so that compiled kernels and the plan's own caches are warm. The process binds itself
+to one core. "wall" counts by the clock, "CPU" by the processor time used: the two differ when other programs want the
+core too.
 
 FOLDER holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans beside the
 checkout. Without it, generated plans take their place; the largest of those have about 900 walls.
@@ -26,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sensing
 from plan_statistics import default_folder, measure
 
 import polyexplore_gym.env as environment
@@ -105,9 +108,9 @@ def timed(seconds: dict[str, float]) -> Iterator[None]:
             setattr(owner, attribute, originals[name])
 
 
-def play(mode: str, plan: FloorPlan, seed: int, limit: int | None = None) -> Played:
+def play(config: EnvConfig, plan: FloorPlan, seed: int, limit: int | None = None) -> Played:
     """One episode with `nearest`, everything included."""
-    env = PolyExploreEnv(config=EnvConfig(drive=DriveConfig(mode=mode)))  # type: ignore[arg-type]
+    env = PolyExploreEnv(config=config)
     policy, rng = make_policy("nearest"), np.random.default_rng(seed)
     played = Played()
     with timed(played.phases):
@@ -135,7 +138,7 @@ def plans_of(shared: tuple[str, ...], generated: tuple[str, ...], folder: Path) 
     return found or [plan_named(name) for name in generated]
 
 
-def rates(repetitions: int, folder: Path) -> dict[tuple[str, str], list[Played]]:
+def rates(configs: dict[str, EnvConfig], repetitions: int, folder: Path) -> dict[tuple[str, str], list[Played]]:
     """Print decisions a second for every plan; returns the episodes by size and mode."""
     rows: list[list[str]] = []
     episodes: dict[tuple[str, str], list[Played]] = defaultdict(list)
@@ -143,18 +146,28 @@ def rates(repetitions: int, folder: Path) -> dict[tuple[str, str], list[Played]]
         plans = plans_of(shared, generated, folder)
         size = f"{statistics.mean(len(plan.segments) for plan in plans):.0f} walls"
         for plan in plans:
-            for mode in MODES:
-                play(mode, plan, seed=0, limit=10)
-                runs = [play(mode, plan, seed) for seed in range(repetitions)]
+            for mode, config in configs.items():
+                play(config, plan, seed=0, limit=10)
+                runs = [play(config, plan, seed) for seed in range(repetitions)]
                 episodes[size, mode] += runs
                 wall = [run.decisions / run.wall for run in runs]
                 cpu = [run.decisions / run.cpu for run in runs]
                 count = statistics.median(run.decisions for run in runs)
-                rows.append([plan.name, f"{len(plan.segments)}", mode, f"{count:g}",
+                scans = statistics.median(run.info["measurements"] for run in runs)
+                rows.append([plan.name, f"{len(plan.segments)}", mode, f"{count:g}", f"{scans:g}",
                              f"{statistics.median(wall):.0f}", f"{statistics.median(cpu):.0f}",
                              f"{1e3 / statistics.median(wall):.1f}"])  # fmt: skip
     print(f"Decisions a second on one core, everything included (median of {repetitions} episodes):\n")
-    header = ("plan", "walls", "drive", "decisions", "decisions/s (wall)", "decisions/s (CPU)", "ms a decision")
+    header = (
+        "plan",
+        "walls",
+        "drive",
+        "decisions",
+        "scans",
+        "decisions/s (wall)",
+        "decisions/s (CPU)",
+        "ms a decision",
+    )
     print(format_table(header, rows, "markdown"), end="\n\n")
     return episodes
 
@@ -173,14 +186,14 @@ def phases(episodes: dict[tuple[str, str], list[Played]]) -> None:
     print(format_table(header, [[name, *(c[name] for c in columns)] for name in columns[0]], "markdown"), end="\n\n")
 
 
-def rooms(repetitions: int) -> None:
+def rooms(configs: dict[str, EnvConfig], repetitions: int) -> None:
     """Print the seconds of an episode on a generated office of 25 rooms."""
     some = suite("office-test")
     plan = next(plan for plan in some.plans() if measure(plan)["rooms"] == ROOMS)
     rows = []
-    for mode in MODES:
-        play(mode, plan, seed=0, limit=10)
-        runs = [play(mode, plan, seed) for seed in range(repetitions)]
+    for mode, config in configs.items():
+        play(config, plan, seed=0, limit=10)
+        runs = [play(config, plan, seed) for seed in range(repetitions)]
         rows.append([mode, f"{statistics.median(run.wall for run in runs):.2f}",
                      f"{statistics.median(run.cpu for run in runs):.2f}",
                      f"{statistics.median(run.decisions for run in runs):g}",
@@ -201,10 +214,10 @@ def resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def memory(decisions: int) -> None:
+def memory(config: EnvConfig, decisions: int) -> None:
     """Print the memory over many decisions in one environment, episode after episode on nine plans."""
     plans = [plan_named(name) for name in MEMORY_PLANS]
-    env = PolyExploreEnv(config=EnvConfig(drive=DriveConfig(mode="kinematic")))
+    env = PolyExploreEnv(config=config)
     policy, rng = make_policy("nearest"), np.random.default_rng(0)
     samples, done, episode = [], 0, 0
     every = max(decisions // 10, 1)
@@ -233,16 +246,25 @@ def main() -> None:
     parser.add_argument("--repetitions", type=int, default=3, help="episodes of each plan and drive")
     parser.add_argument("--decisions", type=int, default=10_000, help="of the memory check")
     parser.add_argument("--plans", type=Path, default=default_folder(), help="folder of plan JSON files")
+    sensing.add_options(parser)
     arguments = parser.parse_args()
+    configs = {
+        mode: sensing.sensing_so(
+            EnvConfig(drive=DriveConfig(mode=mode)),  # type: ignore[arg-type]
+            arguments.sensing,
+            arguments.scan_every,
+        )
+        for mode in MODES
+    }
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     if {"rate", "phases"} & set(arguments.only):
-        episodes = rates(arguments.repetitions, arguments.plans)
+        episodes = rates(configs, arguments.repetitions, arguments.plans)
         phases(episodes)
     if "rooms" in arguments.only:
-        rooms(arguments.repetitions)
+        rooms(configs, arguments.repetitions)
     if "memory" in arguments.only:
-        memory(arguments.decisions)
+        memory(configs["kinematic"], arguments.decisions)
 
 
 if __name__ == "__main__":

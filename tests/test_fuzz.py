@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,23 @@ def test_cases_are_legal_and_come_back(fuzz, first):
         case.plan.check_connected(config.robot.radius)
         if case.start is not None:
             case.plan.check_start(case.start, config.robot.radius)
+
+
+def test_decisions_on_the_way_are_drawn_apart_from_all_else(fuzz, monkeypatch):
+    cases = [fuzz.case_of(number) for number in range(40)]
+    drawn = [case.values["exploration"] for case in cases]
+    counts = Counter((e["decide"], e["scan_every"] > 0.0) for e in drawn)
+    assert counts.keys() == {("arrival", False), ("arrival", True), ("settled", True), ("interval", True)}
+    assert min(counts.values()) >= 4
+    monkeypatch.setattr(fuzz, "_on_the_way", lambda rng, radius, every: {"decide": "arrival"})
+    for case in cases:
+        without = fuzz.case_of(case.number)
+        assert (without.plan, without.criterion, without.start) == (case.plan, case.criterion, case.start)
+        every = without.values["exploration"].pop("scan_every")
+        assert every in (0.0, case.values["exploration"]["scan_every"])
+        for section in ("sensor", "robot", "drive", "pose"):
+            assert without.values[section] == case.values[section]
+        assert without.values["exploration"] | case.values["exploration"] == case.values["exploration"]
 
 
 def test_every_family_of_plans_is_drawn(fuzz):
