@@ -214,6 +214,13 @@ def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
     return float(min(width, 1.6 * total))
 
 
+def room_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
+    """How wide a disc that goes through a chain of open edges (m, 4), gaps included, may be: `tol.gap` at most."""
+    along = shapely.LineString(chain.reshape(-1, 2)).segmentize(0.01 * tol.gap)
+    away = shapely.distance(lines_of(walls), shapely.points(shapely.get_coordinates(along))) if len(walls) else math.inf
+    return float(min(2.0 * np.max(away), tol.gap))
+
+
 # Star polygons ------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from exploration_scenes import star, tol_of, width_of
+from exploration_scenes import room_of, star, tol_of, width_of
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.exploration import jump_edges as je
@@ -242,10 +242,8 @@ def test_summarise():
             size = np.hypot(*(chain[:, 2:] - chain[:, :2]).T)
             assert got.length[q] == pytest.approx(size.sum())
             assert got.width[q] == pytest.approx(width_of(chain, walls, tol))
-            along = shapely.LineString(chain.reshape(-1, 2))  # the gaps too
-            tried = shapely.points(shapely.get_coordinates(along.segmentize(0.01 * tol.gap)))
-            most = 2.0 * shapely.distance(shapely.multilinestrings(walls.reshape(-1, 2, 2)), tried).max()
-            assert min(most, tol.gap) - 0.1 * tol.gap <= got.room[q] <= min(most, tol.gap) + 1e-9
+            most = room_of(chain, walls, tol)
+            assert most - 0.1 * tol.gap <= got.room[q] <= most + 1e-9
             tight += got.room[q] < tol.gap
             narrow += got.width[q] < tol.gap
             way = shapely.multilinestrings(chain.reshape(-1, 2, 2))
