@@ -657,6 +657,7 @@ def test_scans_on_the_way():
             marks = len(np.arange(0.5, driven - 0.25, 0.5)) if driven > 0.75 else 0
             slack = 1 if abs(driven % 0.5 - 0.25) < 1e-6 else 0  # rounding decides on the last one
             slack += 0 if mode == "kinematic" else 1 + marks // 10  # they come with the next time step
+            slack += info["ended"] != "arrived"  # a bump came soon after one
             assert abs(info["measurements"] - before["measurements"] - 1 - marks) <= slack
         scene = env.snapshot()
         way = shapely.LineString(scene.trajectory[:, :2])
