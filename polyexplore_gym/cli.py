@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from polyexplore_gym.mapping import LaserLog, LogMap
     from polyexplore_gym.snapshot import Snapshot
 
-BENCH_PLANS = {"home-test": 16, "angled-test": 4, "office-test": 4}
+BENCH_PLANS = {"home-test": 16, "angled-test": 4, "office-test": 2}
 """What `polyexplore bench` runs on unless told otherwise: so many of the first plans of these suites.
 
-With `COMPARED`, both placements and both ways to sense that takes about two minutes on two cores.
+With `COMPARED`, both placements and both ways to sense the episodes then take about two minutes on two cores.
 """
 SCRIPTED = ("nearest", "largest", "ekman_ratio", "modified_sum", "utility", "distance_advantage", "random")
 """The criteria, which look at nodes one by one (`distance_advantage` at their distances)."""
