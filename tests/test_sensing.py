@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -15,7 +16,8 @@ from polyexplore_gym.floorplan import FloorPlan, generate
 
 ENDS = {"arrived", "settled", "interval", "blocked", "bump", "time", "lost"}
 HALL = FloorPlan.create(
-    [[0, 0], [20, 0], [20, 3], [12, 3], [12, 8], [20, 8], [20, 11], [0, 11], [0, 8], [8, 8], [8, 3], [0, 3]], name="hall"
+    [[0, 0], [20, 0], [20, 3], [12, 3], [12, 8], [20, 8], [20, 11], [0, 11], [0, 8], [8, 8], [8, 3], [0, 3]],
+    name="hall",
 )
 
 
@@ -56,7 +58,7 @@ def test_a_drive_ends_when_its_jump_edge_is_settled(mode):
     assert {info["ended"] for info in infos[1:]} <= ENDS
     assert infos[0]["ended"] == "start"
     settled = short = 0
-    for before, after in zip(infos, infos[1:], strict=False):
+    for before, after in itertools.pairwise(infos):
         driven = after["distance"] - before["distance"]
         if after["ended"] == "settled":
             settled += 1
@@ -83,14 +85,14 @@ def test_arrival_drives_to_the_end():
     env = PolyExploreEnv(generate("home", 3), config=config(decide="arrival"))
     infos = play(env)
     assert {info["ended"] for info in infos[1:]} <= {"arrived", "bump", "time", "lost"}
-    assert any(after["measurements"] > before["measurements"] + 1 for before, after in zip(infos, infos[1:], strict=False))
+    assert any(after["measurements"] > before["measurements"] + 1 for before, after in itertools.pairwise(infos))
 
 
 def test_an_interval_ends_drives_too_and_the_pursued_node_is_marked():
     env = PolyExploreEnv(HALL, config=config(decide="interval", decide_every=1.0))
     infos = play(env, options={"start": (1.0, 1.5)})
     kept = 0
-    for before, after in zip(infos, infos[1:], strict=False):
+    for before, after in itertools.pairwise(infos):
         assert after["distance"] - before["distance"] < 1.5 + 0.5 + 1e-6
         pursued = after["observation"]["node_pursued"]
         assert pursued.sum() <= 1

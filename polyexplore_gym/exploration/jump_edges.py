@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, subtract
-from polyexplore_gym.exploration.segments import point_segment_distance
+from polyexplore_gym.exploration.segments import crossing, point_segment_distance
 from polyexplore_gym.exploration.tolerances import noise_at
 
 _PARALLEL = 0.5
@@ -251,10 +251,19 @@ def clip_known(pieces, known, margin, shortest):
 
 
 @njit(cache=True)
-def shown(segments, sigma, scans, s, tol):
+def _wall_between(ax, ay, bx, by, walls):
+    for w in range(walls.shape[0]):
+        if crossing(ax, ay, bx, by, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) >= 0.0:
+            return True
+    return False
+
+
+@njit(cache=True)
+def shown(segments, sigma, scans, s, walls, tol):
     """Which open edges (m, 4) scan s would have resolved if there were anything behind them: (m,) bool.
 
-    It saw the whole edge from its known side, square enough, with beams close enough, and with range to spare.
+    It saw the whole edge from its known side, square enough, with beams close enough, and with range to spare; and
+    none of the walls (w, 4) stands between it and what lies behind: in a doorway the jambs do, for looks from the side.
     """
     out = np.zeros(segments.shape[0], np.bool_)
     px, py = scans.apexes[s]
@@ -279,6 +288,13 @@ def shown(segments, sigma, scans, s, tol):
                 break
             back = (tol.nudge + 2.0 * max(sigma[i], noise_at(away, tol))) / size
             if not contains(x - back * dy, y + back * dx, scans.points[s], scans.angles, scans.headings[s], scans.full):
+                good = False
+                break
+            bx = x + back * dy
+            by = y - back * dx
+            to_line = square / (square + back * size)
+            ends = to_line + 2.0 * tol.sigma_range / math.hypot(bx, by)
+            if _wall_between(px, py, px + min(ends, 1.0) * bx, py + min(ends, 1.0) * by, walls):
                 good = False
                 break
         out[i] = good

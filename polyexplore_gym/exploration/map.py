@@ -259,7 +259,7 @@ class ExplorationMap:
         kept, origin, changed = jump_edges.clip(p.segments[local], p.sigma[local], scans, s, s + 1, near_walls, tol)
         rows = local[origin]
         fresh, again = jump_edges.clip_known(fresh, kept, tol.nudge + 2.0 * tol.sigma_range, tol.crumb)
-        shown = jump_edges.shown(kept, p.sigma[rows], scans, s, tol)
+        shown = jump_edges.shown(kept, p.sigma[rows], scans, s, near_walls, tol)
         visits = p.visits.copy()
         dirty = np.zeros(len(p.kind), np.bool_)
         dirty[local[changed]] = True

@@ -22,9 +22,9 @@ from polyexplore_gym.sim.robot import SKIN, is_free, nearest_wall
 X, Y, HEADING, SPEED, RATE, LEG, PHASE, DEFICIT, MET = range(9)
 """The state, float64 (9,): pose (m, rad), speed (m/s) and turn rate (rad/s) of the body, leg of the path, phase,
 motion lost to a wall (m, see `forget`), and whether (0, 1) a wall has taken anything."""
-FOLLOW, ALIGN, FINAL, BRAKE, DONE, LOST, BUMP = range(7)
-"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading, or brake to rest straight
-ahead; then the drive has ended: arrived, off the path, held by a wall."""
+FOLLOW, ALIGN, FINAL, DONE, LOST, BUMP = range(6)
+"""The phases: drive along the leg, turn on the spot towards it, turn to the final heading; then the drive has ended:
+arrived, off the path, held by a wall."""
 
 _CUT = 0.048
 """How much of a gentle corner may be cut, radii."""
@@ -120,25 +120,25 @@ def stopping_distance(speed, limits, step):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def entry(state, path, speeds, limits, radius):  # type: ignore[no-untyped-def]
-    """The phase in which a path begins. At rest the robot turns towards it first.
-
-    One that moves follows it at once if it leads on within 45 degrees and does not stop before the robot can; else it
-    brakes straight ahead, for if it turned at speed it would swing out. Arguments as in `command`.
-    """
-    speed = state[SPEED]
-    if path.shape[0] == 1:
-        return FINAL if speed == 0.0 else BRAKE
-    if speed == 0.0:
-        return ALIGN
-    course = math.atan2(path[1, 1] - path[0, 1], path[1, 0] - path[0, 0])
-    stop = 0.0
+def can_stop(state, path, speeds, limits, radius):  # type: ignore[no-untyped-def]
+    """Whether a robot on the first leg of a path comes to rest by its first stop, or little later. As in `command`."""
+    x, y, stop = state[X], state[Y], 0.0
     for k in range(1, path.shape[0]):
-        stop += math.hypot(path[k, 0] - path[k - 1, 0], path[k, 1] - path[k - 1, 1])
+        stop += math.hypot(path[k, 0] - x, path[k, 1] - y)
+        x, y = path[k, 0], path[k, 1]
         if speeds[k] <= 0.0:
             break
-    late = speed * speed / (2.0 * limits[2]) > stop + _OVERSHOOT * radius
-    return BRAKE if late or abs(_wrap(course - state[HEADING])) > _SHARP else FOLLOW
+    return state[SPEED] ** 2 / (2.0 * limits[2]) <= stop + _OVERSHOOT * radius
+
+
+@njit(cache=True)
+def leads_on(state, path, speeds, limits, radius):  # type: ignore[no-untyped-def]
+    """Whether a robot that moves can take up a path without a wide swing: it leads on within 45 degrees, and does not
+    stop long before the robot can. Arguments as in `command`."""
+    if path.shape[0] == 1:
+        return False
+    course = math.atan2(path[1, 1] - path[0, 1], path[1, 0] - path[0, 0])
+    return abs(_wrap(course - state[HEADING])) <= _SHARP and can_stop(state, path, speeds, limits, radius)
 
 
 @njit(cache=True)
@@ -184,12 +184,6 @@ def command(state, path, speeds, heading, final_turn, limits, body, step):  # ty
     max_speed, max_rate, acceleration, turn_acceleration = limits
     x, y, phi = state[X], state[Y], state[HEADING]
     last_leg = path.shape[0] - 2
-    if state[PHASE] == BRAKE:
-        if state[SPEED] == 0.0 and state[RATE] == 0.0:
-            state[PHASE] = DONE
-        state[SPEED] = _towards(state[SPEED], 0.0, acceleration * step)
-        state[RATE] = _towards(state[RATE], 0.0, turn_acceleration * step)
-        return
     for _ in range(2 * path.shape[0] + 4):
         if state[PHASE] == FINAL:
             error = _wrap(heading - phi) if final_turn else 0.0

@@ -91,12 +91,16 @@ class _Cut:
     """m, the next vertex, if any."""
     time: float
     """Driven so far, s: the time limit holds for all the pieces of a drive together."""
+    braking: np.ndarray | None = None
+    """(2, 2) m, the way straight ahead on which it brakes before it takes up its path, if it does."""
 
     @classmethod
-    def of(cls, state: np.ndarray, path: np.ndarray, vertex: int, time: float) -> _Cut:
+    def of(
+        cls, state: np.ndarray, path: np.ndarray, vertex: int, time: float, braking: np.ndarray | None = None
+    ) -> _Cut:
         """From the path (k, 2) driven and the index in it of the next vertex."""
         ahead = tuple(path[vertex].tolist()) if vertex < len(path) else None
-        return cls(state, tuple(path[min(vertex, len(path)) - 1].tolist()), ahead, time)
+        return cls(state, tuple(path[min(vertex, len(path)) - 1].tolist()), ahead, time, braking)
 
     def goes_on(self, path: np.ndarray, radius: float) -> bool:
         """Whether a path (k, 2) leads on to the same next vertex."""
@@ -196,9 +200,7 @@ class World:
     def stop(self) -> DriveResult:
         """Brake to rest straight ahead. It has arrived where it stands then; a wall may end it sooner."""
         path = self._pose[None, :2]
-        if self.config.mode == "kinematic" and self.velocity[0] > 0.0:
-            path = np.vstack([path, self.halt])
-        return self.drive(path)
+        return self.drive(np.vstack([path, self.halt]) if self.velocity[0] > 0.0 else path)
 
     def drive(
         self,
@@ -285,24 +287,43 @@ class World:
         if self._cut is not None:
             state[:] = self._cut.state
             state[follower.LEG] = 0.0
-        if drive is None:
-            state[follower.PHASE] = follower.entry(state, path, speeds, limits, robot.radius)
-            state[follower.MET] = state[follower.DEFICIT] > 0.0
+        braking = self._begin(state, drive, path, speeds)
         steps = max(1, math.ceil(self.config.time_limit / step)) - before
         run = _Run(robot, self._walls, step, limits, state, steps, np.array([way, turn]))
-        if state[follower.PHASE] == follower.BRAKE:
-            run.along(points[:1], speeds, 0.0, False)
+        if braking is not None:
+            run.along(braking, follower.vertex_speeds(braking, limits, robot.radius, step), 0.0, False)
+            vertex = 1
             if state[follower.PHASE] == follower.DONE:
-                points[0] = state[:2]
+                braking, points[0] = None, state[:2]
                 path, keep = apart(points, self._shortest_leg)
                 speeds = follower.vertex_speeds(path, limits, robot.radius, step)
-                state[follower.PHASE] = follower.entry(state, path, speeds, limits, robot.radius)
-        run.along(path, speeds, heading, final_turn)
+                state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
+                state[follower.LEG] = 0.0
+        if braking is None:
+            run.along(path, speeds, heading, final_turn)
+            vertex = int(state[follower.LEG]) + 1
         trajectory, ended = np.concatenate(run.parts), run.ended(path[-1])
-        vertex = int(state[follower.LEG]) + 1
         following = int(keep[vertex]) if vertex < len(keep) else len(points)
-        cut = _Cut.of(state, path, vertex, (before + run.done) * step) if ended == CUT else None
+        cut = _Cut.of(state, path, vertex, (before + run.done) * step, braking) if ended == CUT else None
         return self._end(trajectory, way_length(trajectory), run.done * step, ended, following, cut)
+
+    def _begin(self, state: np.ndarray, drive: _Cut | None, path: np.ndarray, speeds: np.ndarray) -> np.ndarray | None:
+        """Set the phase for a path (k, 2); returns the way (2, 2) to brake on first, if it must not be taken up yet."""
+        limits, radius = self._limits, self.robot.radius
+        if drive is not None:
+            if drive.braking is not None:
+                return drive.braking
+            if len(path) == 1 or follower.can_stop(state, path, speeds, limits, radius):
+                return None
+        else:
+            state[follower.MET] = state[follower.DEFICIT] > 0.0
+            if state[follower.SPEED] == 0.0:
+                state[follower.PHASE] = follower.ALIGN if len(path) > 1 else follower.FINAL
+                return None
+        state[follower.PHASE] = follower.FOLLOW
+        if drive is None and follower.leads_on(state, path, speeds, limits, radius):
+            return None
+        return np.array([state[:2], self.halt])
 
     def _end(
         self, trajectory: np.ndarray, distance: float, duration: float, ended: int, following: int, cut: _Cut | None

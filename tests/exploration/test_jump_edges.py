@@ -225,7 +225,7 @@ def gapped(rng, start, parts):
 
 def test_summarise():
     rng = np.random.default_rng(7)
-    tol, narrow = EXACT, 0
+    tol, narrow, tight = EXACT, 0, 0
     for _ in range(200):
         chains = [gapped(rng, (9.0 * k, 2.0), int(rng.integers(1, 10))) for k in range(3)]
         pieces = np.concatenate(chains)
@@ -242,6 +242,11 @@ def test_summarise():
             size = np.hypot(*(chain[:, 2:] - chain[:, :2]).T)
             assert got.length[q] == pytest.approx(size.sum())
             assert got.width[q] == pytest.approx(width_of(chain, walls, tol))
+            along = shapely.LineString(chain.reshape(-1, 2))  # the gaps too
+            tried = shapely.points(shapely.get_coordinates(along.segmentize(0.01 * tol.gap)))
+            most = 2.0 * shapely.distance(shapely.multilinestrings(walls.reshape(-1, 2, 2)), tried).max()
+            assert min(most, tol.gap) - 0.1 * tol.gap <= got.room[q] <= min(most, tol.gap) + 1e-9
+            tight += got.room[q] < tol.gap
             narrow += got.width[q] < tol.gap
             way = shapely.multilinestrings(chain.reshape(-1, 2, 2))
             middle = shapely.get_coordinates(way.interpolate(0.5, normalized=True))[0]
@@ -255,6 +260,7 @@ def test_summarise():
                 assert abs(got.normal[q] @ chord) < 1e-9
                 assert chord[0] * got.normal[q, 1] - chord[1] * got.normal[q, 0] < 0  # into the unknown, on the right
     assert narrow > 30
+    assert tight > 5
 
 
 def width(pieces, walls=NO_WALLS, tol=EXACT):
@@ -330,7 +336,7 @@ def test_successors_bridge_gaps_only_where_no_wall_stands():
 def test_a_look_counts_only_if_it_could_have_shown_what_is_behind():
     """From the known side, square enough, dense enough, within range, and not hidden: at three points of an edge."""
     rng = np.random.default_rng(9)
-    counts, reasons = [0, 0], np.zeros(4, np.int64)
+    counts, reasons = [0, 0], np.zeros(5, np.int64)
     for fov, beams in itertools.product((1.5, 2 * math.pi), (30, 90, 400) * 20):
         looks, areas = scans(rng, 1, fov, beams, 0.5)
         apex = looks.apexes[0]
@@ -340,7 +346,9 @@ def test_a_look_counts_only_if_it_could_have_shown_what_is_behind():
         pieces[::2, 2:] = pieces[::2, :2] + 0.3 * (pieces[::2, 2:] - pieces[::2, :2])
         d = pieces[:, 2:] - pieces[:, :2]
         normal = np.stack((d[:, 1], -d[:, 0]), axis=1) / np.hypot(*d.T)[:, None]  # into the unknown
-        bad, close_call = np.zeros((80, 4), np.bool_), np.zeros(80, np.bool_)
+        walls = random_pieces(rng, 8)
+        standing = shapely.multilinestrings(walls.reshape(-1, 2, 2))
+        bad, close_call = np.zeros((80, 5), np.bool_), np.zeros(80, np.bool_)
         for share in (0.1, 0.5, 0.9):
             point = pieces[:, :2] + share * d
             away = np.hypot(*(point - apex).T)
@@ -349,9 +357,15 @@ def test_a_look_counts_only_if_it_could_have_shown_what_is_behind():
             noise = np.maximum(sigma, np.hypot(tol.sigma_range, tol.sigma_angle * away))
             before = shapely.points(point - (tol.nudge + 2.0 * noise)[:, None] * normal)
             limits = away - (5.0 - tol.gap), 0.26 - cosine, 2.0 - across
-            bad |= np.stack((*(x > 0.0 for x in limits), ~shapely.covers(areas[0], before)), axis=1)
+            # A wall before the line of the edge, on the way to what lies behind it.
+            behind = point + (tol.nudge + 2.0 * noise)[:, None] * normal - apex
+            share_of_way = away * cosine / (away * cosine + tol.nudge + 2.0 * noise)
+            share_of_way = np.minimum(share_of_way + 2.0 * tol.sigma_range / np.hypot(*behind.T), 1.0)
+            sight = np.stack((np.tile(apex, (80, 1)), apex + share_of_way[:, None] * behind), axis=1)
+            walled = shapely.intersects(shapely.linestrings(sight), standing) & (cosine > 0.0)
+            bad |= np.stack((*(x > 0.0 for x in limits), ~shapely.covers(areas[0], before), walled), axis=1)
             close_call |= np.min(np.abs((*limits, shapely.distance(areas[0].boundary, before))), axis=0) < 1e-9
-        got = je.shown(pieces, sigma, looks, 0, tol)
+        got = je.shown(pieces, sigma, looks, 0, walls, tol)
         sure = ~close_call
         assert (got == ~bad.any(axis=1))[sure].all()
         counts[0] += (~got).sum()
@@ -359,3 +373,52 @@ def test_a_look_counts_only_if_it_could_have_shown_what_is_behind():
         reasons += bad[bad.sum(axis=1) == 1].sum(axis=0)
     assert min(counts) > 100
     assert (reasons > 10).all()  # each of the conditions has turned pieces down alone
+
+
+def test_a_look_along_a_wall_shows_nothing_in_its_doorway():
+    """A doorway of 0.7 m in a wall of 0.3 m, looked at from 4.5 m along the wall: all that is seen is a jamb."""
+    jambs = np.array([[0.0, 0.0, 0.0, 8.0], [0.0, 0.0, -0.3, 0.0], [-0.3, -0.7, 0.0, -0.7], [0.0, -0.7, 0.0, -3.0]])
+    sensor = SensorConfig(beams=721, field_of_view=math.pi, max_range=8.0)
+    tol = tol_of(sensor)
+    edge = np.array([[-0.05, -0.05, -0.05, -0.3]])  # what another scan left open: its unknown side is at x < 0
+    for apex, counts in (((1.2, 4.5), False), ((1.2, 0.6), True)):
+        angles = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 721)
+        far = [shapely.LineString([apex, (apex[0] - 8 * math.cos(a), apex[1] - 8 * math.sin(a))]) for a in angles]
+        lines = shapely.multilinestrings(jambs.reshape(-1, 2, 2))
+        behind = shapely.LineString([(-0.12, 0.0), (-0.12, -0.7)])  # there is a wall in the doorway
+        ranges = [shapely.Point(apex).distance(shapely.union(lines, behind).intersection(line)) for line in far]
+        points, rays = sp.corner_points(angles, np.minimum(np.nan_to_num(ranges, nan=8.0), 8.0), math.pi, 8.0)
+        look = sp.Scans(np.array([apex]), np.array([math.pi]), points[None], rays[None], angles, False, 8.0)
+        assert je.shown(edge, np.zeros(1), look, 0, jambs, tol).tolist() == [counts]
+
+
+def test_what_is_left_of_a_jump_edge_is_still_that_one():
+    """Against the definition: most of what the new chain had an owner, and it is most of what that had."""
+    rng = np.random.default_rng(12)
+    kept = lost = 0
+    for _ in range(300):
+        m = int(rng.integers(2, 12))
+        x = np.concatenate(([0.0], np.cumsum(rng.uniform(0.1, 0.8, m))))
+        segments = np.stack((x[:-1], np.zeros(m), x[1:], np.zeros(m)), axis=1)
+        owner = np.sort(rng.integers(0, 3, m))
+        old = je.Pieces.none()._replace(
+            segments=segments, kind=np.ones(m, np.int8), sigma=np.zeros(m), visits=np.zeros(m, np.int64),
+            settled=np.zeros(m, np.bool_), retried=np.zeros(m, np.bool_), owner=owner,
+        )  # fmt: skip
+        stays = rng.random(m) < 0.7
+        local = np.arange(m)
+        left = je.Pieces(*(column[stays] for column in old))._replace(owner=local[stays])
+        size = x[1:] - x[:-1]
+        _, new, left_of = je.rechain(old, np.ones(m, np.bool_), local, left, je.Pieces.none(), NO_WALLS, 4, 3, EXACT)
+        for q in range(len(new.id)):
+            mine = [i for i in np.flatnonzero(stays) if new.ends[q, 0] <= x[i] and x[i + 1] <= new.ends[q, 2]]
+            whole = sum(size[i] for i in mine)
+            wanted = -1
+            for k in range(3):
+                share = sum(size[i] for i in mine if owner[i] == k)
+                if 2 * share > whole and 2 * share > size[owner == k].sum():
+                    wanted = k
+            assert left_of[q] == wanted
+            kept += wanted >= 0
+            lost += wanted < 0
+    assert min(kept, lost) > 50

@@ -154,16 +154,17 @@ def test_stopping_distance_is_what_braking_takes(step: float) -> None:
 def test_a_robot_that_moves_takes_up_what_leads_on() -> None:
     limits, state = (1.2, 3.0, 0.6, 5.0), np.zeros(9)
 
-    def phase(speed: float, *points: tuple[float, float]) -> int:
+    def leads_on(speed: float, *points: tuple[float, float]) -> bool:
         state[follower.SPEED] = speed
         path = np.array([(0.0, 0.0), *points])
-        return follower.entry(state, path, follower.vertex_speeds(path, limits, 0.25, 0.04), limits, 0.25)
+        return follower.leads_on(state, path, follower.vertex_speeds(path, limits, 0.25, 0.04), limits, 0.25)
 
-    assert phase(0.0) == follower.FINAL
-    assert phase(0.0, (3.0, 0.0)) == follower.ALIGN
-    assert phase(0.1) == follower.BRAKE
-    assert phase(1.2, (3.0, 0.0)) == phase(1.2, (3.0, 2.9)) == follower.FOLLOW
-    assert phase(1.2, (3.0, 3.1)) == phase(1.2, (-3.0, 0.0)) == follower.BRAKE
-    assert phase(1.2, (1.0, 0.0)) == phase(1.2, (0.5, 0.0), (5.0, 0.1)) == follower.FOLLOW
-    assert phase(1.2, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0)) == follower.BRAKE  # a stop that it would overshoot
-    assert phase(0.5, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0)) == follower.FOLLOW
+    assert not leads_on(0.1)
+    assert leads_on(1.2, (3.0, 0.0))
+    assert leads_on(1.2, (3.0, 2.9))
+    assert not leads_on(1.2, (3.0, 3.1))
+    assert not leads_on(1.2, (-3.0, 0.0))
+    assert leads_on(1.2, (1.0, 0.0))
+    assert leads_on(1.2, (0.5, 0.0), (5.0, 0.1))
+    assert not leads_on(1.2, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0))  # a stop that it would overshoot
+    assert leads_on(0.5, (0.5, 0.0), (0.6, 0.0), (0.6, 5.0))
