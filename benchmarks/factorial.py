@@ -8,7 +8,7 @@ Factors: field of view (180, 360 degrees), maximum range (8, 30 m), laser noise 
 pose (exact, gaussian, odometry, slam), all criteria, both placements, and scans and decisions at stops or on the way
 (`--sensing`). Every plan meets each pose model once and each level of the first three twice: half of their 2 x 2 x 2
 combinations, such that no two of the factors go together, with the pose models dealt out at random. On a plan all
-criteria, placements and ways to sense meet the same start and noise. Plans are those that `polyexplore bench` plays
+criteria, placements and ways to sense meet the same start and noise. Plans are generated (`plan_statistics.SUITES`)
 and, where they are, the shared ones. The drive is kinematic. Odometry that nothing corrects is played on plans of at
 most 300 m2 only: on larger ones the map falls apart before it is complete.
 
@@ -36,9 +36,8 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 import sensing
-from plan_statistics import default_folder
+from plan_statistics import SUITES, default_folder
 
-from polyexplore_gym.cli import BENCH_PLANS
 from polyexplore_gym.config import DriveConfig, EnvConfig, PoseConfig, SensorConfig
 from polyexplore_gym.evaluation import EpisodeRecord, Setting, Study, evaluate, name_policies
 from polyexplore_gym.evaluation.statistics import Interval, bootstrap_interval, geometric_mean
@@ -284,7 +283,7 @@ def main() -> None:
     options = parser.parse_args()
     real = [load_plan(path) for path in sorted(options.plans.glob("*.json"))]
     real = [plan for plan in real if plan.area <= options.largest][: options.first]
-    drawn = [suite(name).plan(i) for name, n in BENCH_PLANS.items() for i in range(n)[: options.first]]
+    drawn = [suite(name).plan(i) for name, n in SUITES.items() for i in range(n)[: options.first]]
     if not real:
         print(f"no plans in {options.plans}: generated plans only (--plans names another folder)")
     dealt = deal([*real, *drawn], np.random.default_rng(0))

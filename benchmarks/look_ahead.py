@@ -4,12 +4,11 @@
                                     [--sensing stops moving] [--scan-every 0.5] [--workers 2]
                                     [--out results/look_ahead]
 
-Nodes in front of the jump edges, kinematic drive. One row a planner, set of plans and way to sense: the suites for
-tests as `polyexplore bench` takes them, and the shared plans where there are any. Distance over that of `nearest` on
-the same start (geometric mean and ratio of the means) and probability of the shorter way, with 95 % intervals over
-buildings, over the starts that all planners finished; milliseconds a decision, mean and longest. With `--models`,
-selectors trained with different seeds, the last table says what the seed changes: mean over the models, Student's 95 %
-interval.
+Nodes in front of the jump edges, kinematic drive. One row a planner, set of plans and way to sense: generated plans
+(`plan_statistics.SUITES`), and the shared ones where there are any. Distance over that of `nearest` on the same start
+(geometric mean and ratio of the means) and probability of the shorter way, with 95 % intervals over buildings, over the
+starts that all planners finished; milliseconds a decision, mean and longest. With `--models`, selectors trained with
+different seeds, the last table says what the seed changes: mean over the models, Student's 95 % interval.
 
 FOLDER (`--plans`) holds plan JSON files; default: `floorplans` under $POLYEXPLORE_DATA, or ../shared/data/floorplans
 beside the checkout. A run that was stopped goes on where it was.
@@ -26,10 +25,10 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 import sensing
-from plan_statistics import default_folder
+from plan_statistics import SUITES, default_folder
 
 from baselines import make_policy
-from polyexplore_gym.cli import BENCH_PLANS, LOOK_AHEAD
+from polyexplore_gym.cli import LOOK_AHEAD
 from polyexplore_gym.config import DriveConfig, EnvConfig
 from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, evaluate, name_policies
 from polyexplore_gym.evaluation.statistics import Interval
@@ -40,7 +39,7 @@ from polyexplore_gym.floorplan import FloorPlan, load_plan, suite
 
 def plan_sets(folder: Path | None, largest: float, first: int | None) -> dict[str, list[FloorPlan]]:
     """The plans by set; those in `folder` only if one is given."""
-    sets = {name: [suite(name).plan(i) for i in range(count)][:first] for name, count in BENCH_PLANS.items()}
+    sets = {name: [suite(name).plan(i) for i in range(count)][:first] for name, count in SUITES.items()}
     real = [load_plan(path) for path in sorted(folder.glob("*.json"))] if folder else []
     sets["real and drawn"] = [plan for plan in real if plan.area <= largest][:first]
     return {name: plans for name, plans in sets.items() if plans}

@@ -31,6 +31,8 @@ MIN_PROMINENCE = 0.1
 MIN_ROOM = 1.0
 DOOR_WIDTHS = (0.6, 1.8)
 LOOP_HOLE = 4.0
+SUITES = {"home-test": 24, "angled-test": 12, "office-test": 12}
+"""What studies of generated plans run on: so many of the first plans of these suites."""
 GROUPS = {
     "home": ("home", "home-arena"),
     "office and lab": ("office", "lab"),

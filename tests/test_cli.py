@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polyexplore_gym.cli import BENCH_PLANS, LOOK_AHEAD, SCRIPTED, main
+from polyexplore_gym.cli import BENCH_PLANS, COMPARED, LOOK_AHEAD, SCRIPTED, main
 from polyexplore_gym.evaluation import read_manifest, read_records
 from polyexplore_gym.floorplan import FloorPlan, save_plan
 
@@ -442,4 +442,5 @@ def test_the_default_bench_exists():
 
     # The learned one needs torch, which the core does without.
     assert set(SCRIPTED) == set(policy_names()) - {"learned", *LOOK_AHEAD}
+    assert set(COMPARED) < set(SCRIPTED)
     assert all(0 < count <= len(suite(name)) for name, count in BENCH_PLANS.items())
