@@ -421,19 +421,21 @@ def distinct(candidates, forms, position, shape, kind, n_vertices, tol):
     return keep
 
 
-@njit(cache=True, inline="always")
-def tangent(dx, dy, length, x, y, shape, v, short):
-    """Whether a leg in direction d (a unit vector) at corner vertex v can be part of a taut path."""
+@njit(cache=True)
+def tangent(dx, dy, length, rx, ry, ax, ay, bx, by, limit, short):
+    """Whether a leg in direction d (a unit vector) at a vertex r from its corner can be part of a taut path.
+
+    Its walls run in the directions a and b from there (see `Shapes`). Numbers, not arrays: these would cost more to
+    hand over than what is done with them.
+    """
     # Short legs turn round one corner, whose vertices need not stand just where they should.
-    if shape.limit[v] >= OPEN_SPACE or length <= short:
+    if limit >= OPEN_SPACE or length <= short:
         return True
-    rx = x - shape.anchor[v, 0]
-    ry = y - shape.anchor[v, 1]
-    if abs(dx * rx + dy * ry) > shape.limit[v] * norm(rx, ry):
+    if abs(dx * rx + dy * ry) > limit * norm(rx, ry):
         return False
     side = dy * rx - dx * ry
-    c1 = dx * shape.first[v, 1] - dy * shape.first[v, 0]
-    c2 = dx * shape.second[v, 1] - dy * shape.second[v, 0]
+    c1 = dx * ay - dy * ax
+    c2 = dx * by - dy * bx
     if side > 0.0:
         return c1 >= -_LEEWAY and c2 >= -_LEEWAY
     return c1 <= _LEEWAY and c2 <= _LEEWAY

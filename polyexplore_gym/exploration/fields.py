@@ -22,53 +22,50 @@ _SPARE = 2.0
 
 
 @njit(cache=True, inline="always")
-def _enter(v, d, head, after, before, inside):
-    """Put a vertex at distance d into its bucket, out of any other. Returns the bucket."""
+def _enter(v, d, head, after, entry, inside, count):
+    """Put a vertex at distance d into its bucket, out of any other. Returns the bucket and the entries in use."""
     b = min(int(d * _PER_METRE), _BUCKETS - 1)
     if inside[v] != b:
-        if inside[v] >= 0:
-            _leave(v, head, after, before, inside)
-        after[v] = head[b]
-        before[v] = -1
-        if head[b] >= 0:
-            before[head[b]] = v
-        head[b] = v
         inside[v] = b
-    return b
-
-
-@njit(cache=True, inline="always")
-def _leave(v, head, after, before, inside):
-    if before[v] >= 0:
-        after[before[v]] = after[v]
-    else:
-        head[inside[v]] = after[v]
-    if after[v] >= 0:
-        before[after[v]] = before[v]
-    inside[v] = -1
+        entry[count] = v
+        after[count] = head[b]
+        head[b] = count
+        count += 1
+    return b, count
 
 
 @njit(cache=True)
-def _settle(dist, parent, source, reach, low, high, head, after, before, inside, links, kind):
-    """Empty the queue, whose buckets from `low` to `high` hold vertices; leaves but the source are not gone through."""
-    first, degree, _, target, cost, _ = links
+def _settle(dist, parent, reach, low, high, head, after, entry, inside, count, first, degree, target, cost, kind):
+    """Empty the queue, whose buckets from `low` to `high` hold vertices in `count` entries.
+
+    `head` is the last entry of each bucket, `after` what follows an entry; a vertex that is not `inside` the bucket
+    any more has moved on. Leaves do not enter: no path goes through them.
+    """
     b = low
     while b <= high:
-        v = head[b]
-        if v < 0:
+        e = head[b]
+        if e < 0:
             b += 1
             continue
-        _leave(v, head, after, before, inside)
-        d = dist[v]
-        if kind[v] == LEAF and v != source:
+        head[b] = after[e]
+        v = entry[e]
+        if inside[v] != b:
             continue
-        for h in range(first[v], first[v] + degree[v]):
+        inside[v] = -1
+        if count + degree[v] > entry.size:
+            after = np.concatenate((after, np.empty_like(after)))
+            entry = np.concatenate((entry, np.empty_like(entry)))
+        d = dist[v]
+        h0 = np.uint64(first[v])
+        for h in range(h0, h0 + np.uint64(degree[v])):
             w = target[h]
-            if d + cost[h] < dist[w]:
-                dist[w] = d + cost[h]
+            far = d + cost[h]
+            if far < dist[w]:
+                dist[w] = far
                 parent[w] = v
-                if kind[w] != LEAF and dist[w] <= reach:
-                    high = max(high, _enter(w, dist[w], head, after, before, inside))
+                if far <= reach and kind[w] != LEAF:
+                    bw, count = _enter(w, far, head, after, entry, inside, count)
+                    high = max(high, bw)
 
 
 @njit(cache=True)
@@ -77,20 +74,23 @@ def grow(row, source, to, dist, parent, reach, links, kind):
 
     A new one has the reach -1 and is infinite but at its source.
     """
+    n = dist.shape[1]
     head = np.full(_BUCKETS, -1, np.int32)
-    after = np.empty(dist.shape[1], np.int32)
-    before = np.empty(dist.shape[1], np.int32)
-    inside = np.full(dist.shape[1], -1, np.int32)
+    after = np.empty(4 * n, np.int32)
+    entry = np.empty(4 * n, np.uint32)
+    inside = np.full(n, -1, np.int16)
+    count = 0
     d = dist[row]
     low = _BUCKETS
     high = -1
     for v in range(d.size):
         if reach[row] < d[v] <= to and d[v] < math.inf and (kind[v] != LEAF or v == source):
-            b = _enter(v, d[v], head, after, before, inside)
+            b, count = _enter(v, d[v], head, after, entry, inside, count)
             low = min(low, b)
             high = max(high, b)
     reach[row] = to
-    _settle(d, parent[row], source, to, low, high, head, after, before, inside, links, kind)
+    _settle(d, parent[row], to, low, high, head, after, entry, inside, count, links.first, links.degree, links.target,
+            links.cost, kind)  # fmt: skip
 
 
 @njit(cache=True)
@@ -125,32 +125,42 @@ def between(rows, sources, guess, dist, parent, reach, links, kind):
 def repair(dist, parent, reach, sources, cut, added, length, links, kind):
     """Repair the fields dist, parent (k, v), reach (k,) of `sources` (k,) (-1: none) after edges (e, 2) were cut and
     added."""
-    affected = np.empty(dist.shape[1], np.int64)
+    n = dist.shape[1]
     head = np.full(_BUCKETS, -1, np.int32)
-    after = np.empty(dist.shape[1], np.int32)
-    before = np.empty(dist.shape[1], np.int32)
-    inside = np.full(dist.shape[1], -1, np.int32)
+    after = np.empty(4 * n + 2 * added.shape[0], np.int32)
+    entry = np.empty(after.size, np.uint32)
+    inside = np.full(n, -1, np.int16)
+    affected = np.empty(n, np.uint32)
+    target, cost = links.target, links.cost
+    runs = _runs(cut)
+    live = np.empty(runs.size, np.bool_)
+    ends, size, through = _standing(added, length, kind)
     for k in range(sources.size):
         s = sources[k]
         if s < 0:
             continue
         d = dist[k]
         p = parent[k]
+        for r in range(runs.size - 1):
+            live[r] = d[cut[runs[r], 0]] < math.inf
         n_hit = 0
-        for e in range(cut.shape[0]):
-            for side in range(2):
-                v = cut[e, side]
-                if p[v] == cut[e, 1 - side] and d[v] < math.inf:
-                    p[v] = -1
-                    d[v] = math.inf
-                    affected[n_hit] = v
-                    n_hit += 1
+        for r in range(runs.size - 1):
+            # A vertex that the field does not reach is nobody's parent.
+            for e in range(runs[r], runs[r + 1] if live[r] else 0):
+                for side in range(2):
+                    v = cut[e, side]
+                    if p[v] == cut[e, 1 - side] and d[v] < math.inf:
+                        p[v] = -1
+                        d[v] = math.inf
+                        affected[n_hit] = v
+                        n_hit += 1
         i = 0
         while i < n_hit:
             v = affected[i]
             i += 1
-            for h in range(links.first[v], links.first[v] + links.degree[v]):
-                w = links.target[h]
+            h0 = np.uint64(links.first[v])
+            for h in range(h0, h0 + np.uint64(links.degree[v])):
+                w = target[h]
                 if p[w] == v and d[w] < math.inf:
                     p[w] = -1
                     d[w] = math.inf
@@ -158,28 +168,65 @@ def repair(dist, parent, reach, sources, cut, added, length, links, kind):
                     n_hit += 1
         low = _BUCKETS
         high = -1
+        count = 0
         for i in range(n_hit):
             v = affected[i]
-            for h in range(links.first[v], links.first[v] + links.degree[v]):
-                w = links.target[h]
-                if (kind[w] != LEAF or w == s) and d[w] + links.cost[h] < d[v]:
-                    d[v] = d[w] + links.cost[h]
-                    p[v] = w
-            if d[v] < math.inf and d[v] <= reach[k] and kind[v] != LEAF:
-                b = _enter(v, d[v], head, after, before, inside)
-                low = min(low, b)
-                high = max(high, b)
-        for e in range(added.shape[0]):
-            if kind[added[e, 0]] < 0 or kind[added[e, 1]] < 0:
-                continue
+            best = math.inf
+            by = np.uint32(0)
+            h0 = np.uint64(links.first[v])
+            for h in range(h0, h0 + np.uint64(links.degree[v])):
+                w = target[h]
+                if d[w] + cost[h] < best and (kind[w] != LEAF or w == s):
+                    best = d[w] + cost[h]
+                    by = w
+            if best < math.inf:
+                d[v] = best
+                p[v] = by
+                if best <= reach[k] and kind[v] != LEAF:
+                    b, count = _enter(v, best, head, after, entry, inside, count)
+                    low = min(low, b)
+                    high = max(high, b)
+        for e in range(size.size):
             for side in range(2):
-                v = added[e, side]
-                w = added[e, 1 - side]
-                if (kind[w] != LEAF or w == s) and d[w] + length[e] < d[v]:
-                    d[v] = d[w] + length[e]
+                v = ends[e, side]
+                w = ends[e, 1 - side]
+                if d[w] + size[e] < d[v] and (through[e, 1 - side] or w == s):
+                    d[v] = d[w] + size[e]
                     p[v] = w
-                    if kind[v] != LEAF and d[v] <= reach[k]:
-                        b = _enter(v, d[v], head, after, before, inside)
+                    if through[e, side] and d[v] <= reach[k]:
+                        b, count = _enter(v, d[v], head, after, entry, inside, count)
                         low = min(low, b)
                         high = max(high, b)
-        _settle(d, p, s, reach[k], low, high, head, after, before, inside, links, kind)
+        _settle(
+            d, p, reach[k], low, high, head, after, entry, inside, count, links.first, links.degree, target, cost, kind
+        )
+
+
+@njit(cache=True)
+def _runs(cut):
+    """Where the rows (k + 1,) of edges (e, 2) with the same first vertex begin, and the end."""
+    out = np.empty(cut.shape[0] + 1, np.int64)
+    k = 0
+    for e in range(cut.shape[0]):
+        if e == 0 or cut[e, 0] != cut[e - 1, 0]:
+            out[k] = e
+            k += 1
+    out[k] = cut.shape[0]
+    return out[: k + 1]
+
+
+@njit(cache=True)
+def _standing(added, length, kind):
+    """The edges (e, 2) that no wall has taken since: their ends, lengths, and whether paths lead through each end."""
+    ends = np.empty(added.shape, np.uint32)
+    size = np.empty(added.shape[0])
+    through = np.empty(added.shape, np.bool_)
+    k = 0
+    for e in range(added.shape[0]):
+        if kind[added[e, 0]] >= 0 and kind[added[e, 1]] >= 0:
+            ends[k] = added[e]
+            size[k] = length[e]
+            for side in range(2):
+                through[k, side] = kind[added[e, side]] != LEAF
+            k += 1
+    return ends[:k], size[:k], through[:k]

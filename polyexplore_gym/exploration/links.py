@@ -15,11 +15,15 @@ from numba import njit
 from polyexplore_gym.exploration.corners import BEND, CORNER, LEAF, TRAIL, Shapes, tangent
 from polyexplore_gym.exploration.segments import (
     crossing_free,
+    first_hit,
     norm,
     point_segment_distance,
     segment_distance,
     sweep_free,
 )
+
+_BLOCKERS = 8
+"""So many walls that blocked the last legs are tried before all others."""
 
 
 class Vertices(NamedTuple):
@@ -57,7 +61,7 @@ class Links(NamedTuple):
     def none(cls, vertices: int, rows: int) -> Links:
         """Nothing yet, with space for so many vertices and half-edges."""
         z = np.zeros(vertices, np.int64)
-        return cls(z, z.copy(), z.copy(), np.zeros(rows, np.int32), np.zeros(rows), np.zeros(rows))
+        return cls(z, z.copy(), z.copy(), np.zeros(rows, np.uint32), np.zeros(rows), np.zeros(rows))
 
 
 @njit(cache=True)
@@ -248,20 +252,19 @@ def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
     return cut[:count].copy(), keep
 
 
-@njit(cache=True, inline="always")
-def _open(u, v, vertices, pieces, slack):
+@njit(cache=True)
+def _open(u, v, position, kind, owner, pieces, slack):
     """Whether no open edge lies between two vertices, but near leaves and those that they may look through."""
     return crossing_free(
-        vertices.position[u, 0], vertices.position[u, 1], vertices.position[v, 0], vertices.position[v, 1], pieces,
-        vertices.owner[u], vertices.owner[v],
-        slack if vertices.kind[u] == LEAF else 0.0, slack if vertices.kind[v] == LEAF else 0.0,
+        position[u, 0], position[u, 1], position[v, 0], position[v, 1], pieces, owner[u], owner[v],
+        slack if kind[u] == LEAF else 0.0, slack if kind[v] == LEAF else 0.0,
     )  # fmt: skip
 
 
 @njit(cache=True)
 def unblocked(blocked, vertices, box, pieces, slack):
     """Which of the blocked edges (b, 2) that meet `box` (x0, y0, x1, y1) no open edge crosses any more."""
-    position = vertices.position
+    position, kind, owner = vertices.position, vertices.kind, vertices.owner
     free = np.zeros(blocked.shape[0], np.bool_)
     for e in range(blocked.shape[0]):
         u = blocked[e, 0]
@@ -273,23 +276,47 @@ def unblocked(blocked, vertices, box, pieces, slack):
             or min(position[u, 1], position[v, 1]) > box[3]
         ):
             continue
-        free[e] = _open(u, v, vertices, pieces, slack)
+        free[e] = _open(u, v, position, kind, owner, pieces, slack)
     return free
+
+
+@njit(cache=True)
+def _crosses_one(ax, ay, ux, uy, segments, n):
+    """Whether the leg from a by u properly crosses one of n segments; that comes to the front."""
+    for k in range(n):
+        s1 = ux * (segments[k, 1] - ay) - uy * (segments[k, 0] - ax)
+        s2 = ux * (segments[k, 3] - ay) - uy * (segments[k, 2] - ax)
+        if s1 * s2 >= 0.0:
+            continue
+        vx = segments[k, 2] - segments[k, 0]
+        vy = segments[k, 3] - segments[k, 1]
+        t1 = vx * (ay - segments[k, 1]) - vy * (ax - segments[k, 0])
+        t2 = t1 + vx * uy - vy * ux
+        if t1 * t2 < 0.0:
+            if k > 0:
+                for j in range(4):
+                    segments[k, j], segments[k - 1, j] = segments[k - 1, j], segments[k, j]
+            return True
+    return False
 
 
 @njit(cache=True)
 def connect(fresh, vertices, n_vertices, walls, pieces, tol):
     """New edges between the `fresh` vertices and all others: (e, 2) vertices, lengths, needs, and which are open."""
-    position, shape, kind = vertices.position, vertices.shape, vertices.kind
+    position, kind, relaxed = vertices.position, vertices.kind, vertices.relaxed
+    anchor, first, second, limit = vertices.shape
+    segments = walls.segments
     capacity = 256
     pairs = np.empty((capacity, 2), np.int64)
     length = np.empty(capacity)
     wants = np.empty(capacity)
-    free = np.empty(capacity, np.bool_)
     count = 0
     rank = np.full(n_vertices, -1, np.int64)
     for i in range(fresh.size):
         rank[fresh[i]] = i
+    # What blocked the last legs blocks most of the next: neighbours have neighbouring numbers.
+    blocker = np.zeros((_BLOCKERS, 4))
+    n_blockers = 0
     for i in range(fresh.size):
         u = fresh[i]
         if kind[u] < 0:
@@ -304,31 +331,43 @@ def connect(fresh, vertices, n_vertices, walls, pieces, tol):
             d = norm(dx, dy)
             if d > (tol.last_leg if kind[u] == LEAF or kind[v] == LEAF else tol.leg):
                 continue
-            if d > tol.trail_edge and max(shape.limit[u], shape.limit[v]) >= TRAIL:
+            if d > tol.trail_edge and max(limit[u], limit[v]) >= TRAIL:
                 continue
             d1 = d if d > 0.0 else 1.0
-            if kind[u] != LEAF and not tangent(dx / d1, dy / d1, d, ux, uy, shape, u, tol.short_leg):
+            if kind[u] != LEAF and not tangent(
+                dx / d1, dy / d1, d, ux - anchor[u, 0], uy - anchor[u, 1], first[u, 0], first[u, 1], second[u, 0],
+                second[u, 1], limit[u], tol.short_leg,
+            ):  # fmt: skip
                 continue
             if kind[v] != LEAF and not tangent(
-                dx / d1, dy / d1, d, position[v, 0], position[v, 1], shape, v, tol.short_leg
-            ):
+                dx / d1, dy / d1, d, position[v, 0] - anchor[v, 0], position[v, 1] - anchor[v, 1], first[v, 0],
+                first[v, 1], second[v, 0], second[v, 1], limit[v], tol.short_leg,
+            ):  # fmt: skip
                 continue
-            want = min(tol.sweep, vertices.relaxed[u], vertices.relaxed[v])
-            if not sweep_free(ux, uy, position[v, 0], position[v, 1], walls, want):
+            if _crosses_one(ux, uy, dx, dy, blocker, n_blockers):
+                continue
+            want = min(tol.sweep, relaxed[u], relaxed[v])
+            hit = first_hit(ux, uy, position[v, 0], position[v, 1], walls, want)
+            if hit >= 0:
+                n_blockers = min(n_blockers + 1, _BLOCKERS)
+                for k in range(n_blockers - 1, 0, -1):
+                    blocker[k] = blocker[k - 1]
+                blocker[0] = segments[hit]
                 continue
             if count == capacity:
                 capacity *= 2
                 pairs = np.concatenate((pairs, np.empty((count, 2), np.int64)))
                 length = np.concatenate((length, np.empty(count)))
                 wants = np.concatenate((wants, np.empty(count)))
-                free = np.concatenate((free, np.empty(count, np.bool_)))
             pairs[count, 0] = u
             pairs[count, 1] = v
             length[count] = d
             wants[count] = want
-            free[count] = _open(u, v, vertices, pieces, tol.slack)
             count += 1
-    return pairs[:count].copy(), length[:count].copy(), wants[:count].copy(), free[:count].copy()
+    free = np.empty(count, np.bool_)
+    for e in range(count):
+        free[e] = _open(pairs[e, 0], pairs[e, 1], position, kind, vertices.owner, pieces, tol.slack)
+    return pairs[:count].copy(), length[:count].copy(), wants[:count].copy(), free
 
 
 @njit(cache=True)

@@ -171,8 +171,8 @@ def walk(ax, ay, bx, by, cell):
 
 
 @njit(cache=True)
-def sweep_free(ax, ay, bx, by, obstacles, radius):
-    """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
+def first_hit(ax, ay, bx, by, obstacles, radius):
+    """A segment nearer than `radius` (<= the grid's margin) to a-b, about the first on the way; -1 if none is."""
     segments = obstacles.segments
     start = obstacles.start
     items = obstacles.items
@@ -201,14 +201,20 @@ def sweep_free(ax, ay, bx, by, obstacles, radius):
             if (t1 < -radius and t2 < -radius) or (t1 > length + radius and t2 > length + radius):
                 continue
             if segment_distance(ax, ay, bx, by, cx, cy, ex, ey) < radius:
-                return False
+                return i
         if tx < ty:
             ix += sx
             tx += wx
         else:
             iy += sy
             ty += wy
-    return True
+    return -1
+
+
+@njit(cache=True)
+def sweep_free(ax, ay, bx, by, obstacles, radius):
+    """Whether every segment keeps at least `radius` (<= the grid's margin) from a-b."""
+    return first_hit(ax, ay, bx, by, obstacles, radius) < 0
 
 
 @njit(cache=True)

@@ -23,6 +23,7 @@ from exploration_scenes import (
 )
 
 from polyexplore_gym.config import SensorConfig
+from polyexplore_gym.exploration import links
 from polyexplore_gym.exploration.corners import CORNER, LEAF, TRAIL
 from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.exploration.tolerances import squeezed
@@ -457,3 +458,21 @@ def test_retreat_leads_away_from_the_wall_that_was_touched():
                 assert lines.distance(shapely.Point(rx, ry)) >= TOL.need - 1e-9
                 assert lines.distance(shapely.LineString([(x, y), (rx, ry)])) >= near - 1e-5
     assert found > 20
+
+
+def test_what_blocked_a_leg_is_tried_first_and_comes_forward():
+    rng = np.random.default_rng(6)
+    found = 0
+    for _ in range(300):
+        walls, leg = rng.uniform(-3.0, 3.0, (6, 4)), rng.uniform(-3.0, 3.0, 4)
+        crossed = shapely.crosses(shapely.linestrings(walls.reshape(-1, 2, 2)), shapely.linestrings(leg.reshape(2, 2)))
+        order = walls.copy()
+        got = links._crosses_one(leg[0], leg[1], leg[2] - leg[0], leg[3] - leg[1], order, len(order))
+        assert got == crossed.any()
+        k = int(crossed.argmax())
+        wanted = list(range(6))
+        if got and k:
+            wanted[k - 1], wanted[k] = k, k - 1
+        np.testing.assert_array_equal(order, walls[wanted])
+        found += got
+    assert 50 < found < 250

@@ -114,3 +114,15 @@ def test_crossing_free_with_owners_and_slack(seed):
 def test_array_bounds_are_checked():
     with pytest.raises(IndexError):
         _point_distances(np.zeros((2, 2)), np.zeros((1, 4)))
+
+
+def test_first_hit_names_a_wall_that_is_near():
+    rng = np.random.default_rng(5)
+    walls = random_segments(rng, 60)
+    index = sg.indexed(walls, np.full(60, -1), np.ones(60, bool), 0.6, 1.0)
+    legs = random_segments(rng, 400)
+    near = shapely.distance(line(legs)[:, None], line(walls)) < 0.3
+    got = np.array([sg.first_hit(*leg, index, 0.3) for leg in legs])
+    assert 40 < (got < 0).sum() < 360
+    np.testing.assert_array_equal(got >= 0, near.any(axis=1))
+    assert near[np.flatnonzero(got >= 0), got[got >= 0]].all()
