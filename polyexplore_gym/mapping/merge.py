@@ -7,19 +7,21 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
+from polyexplore_gym.mapping.fit import by_pose, distance2, distance2_shared, fuse, product, to_map, wrap
 from polyexplore_gym.mapping.grid import Grid, grid_query
 from polyexplore_gym.mapping.slots import (
     MEMORY,
     Lines,
     Rows,
     Slots,
+    carry,
     facing,
     feed,
     free_line,
     free_row,
     new_row,
     oriented,
+    oriented_shared,
     publish,
     store,
     told_apart,
@@ -95,11 +97,14 @@ def candidates(
     door: float,
     stamp: int,
     own: int,
+    seen_by: np.ndarray,
+    drifting: bool,
     found: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, bool]:
     """Map lines that pass the merge test with new line i (map frame): the best first.
 
+    seen_by (2, 3): K of the new line; with `drifting` lines may share an error with the pose that it was seen from.
     Each row of `out` is line slot, d2, x, y of the middle between the pieces compared. What another line of the
     scan feeds (in insert `stamp`) is left out, but for `own`. Returns their number, and whether it is clear which
     one it is: not so if a scan told the best and another one apart.
@@ -125,7 +130,11 @@ def candidates(
                 continue
             rho_j, alpha_j, p_j = oriented(lines, j)
             x, y = 0.25 * (s[0] + s[2] + r[0] + r[2]), 0.25 * (s[1] + s[3] + r[1] + r[3])
-            d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
+            if drifting:
+                common = product(seen_by, oriented_shared(lines, j).T)
+                d2 = distance2_shared(rho, alpha, p, rho_j, alpha_j, p_j, common, x, y)
+            else:
+                d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
             if d2 < gate:
                 at = count
                 while at > 0 and (out[at - 1, 1] > d2 or (out[at - 1, 1] == d2 and out[at - 1, 0] > j)):
@@ -327,7 +336,9 @@ def fused_in_scan(
     x, y = x / pieces, y / pieces
     if distance2(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y) >= gate:
         return False
-    rho[i], alpha[i], covariance[i] = fuse(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y)
+    rho[i], alpha[i], covariance[i], _, _ = fuse(
+        rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], np.zeros((2, 2)), x, y
+    )
     of[of == j] = i
     return True
 
@@ -347,6 +358,9 @@ def insert(
     gate: float,
     door: float,
     grouping: bool,
+    drifting: bool,
+    moved: np.ndarray,
+    pose_information: np.ndarray,
     rows: Rows,
     lines: Lines,
     grid: Grid,
@@ -355,7 +369,11 @@ def insert(
     """Insert one scan's lines and fragments; the touched rows are left in `slots`.
 
     Without grouping the lines are taken one by one, as if each came from a scan of its own.
+    With `drifting` the pose's error is that of the last insert, carried along the way `moved` (2,), and what the way
+    added; pose_information (3, 3) is the (pseudo-)inverse of its covariance.
     """
+    if drifting:
+        carry(lines, moved[0], moved[1])
     slots.counts[2] += 1
     slots.counts[3] = 0
     stamp = slots.counts[2]
@@ -388,7 +406,10 @@ def insert(
         i = first
         while i >= 0:
             r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
-            count, clear = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, -1, found, match)
+            count, clear = candidates(
+                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, -1, by_pose(a0, pose), drifting,
+                found, match,
+            )  # fmt: skip
             looking, i = i, -1
             for q in range(count if clear else 0):
                 j, d2 = int(match[q, 0]), match[q, 1]
@@ -413,21 +434,33 @@ def insert(
         if best[i] == -2:
             continue
         r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
+        seen_by = by_pose(a0, pose)
+        c0 = product(seen_by, pose_covariance) if drifting else np.zeros((2, 3))
         target, count = -1, 0
         if best[i] >= 0:
             count, _ = candidates(
-                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, best[i], found, match
-            )
+                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, best[i], seen_by, drifting,
+                found, match,
+            )  # fmt: skip
         for q in range(count):
             j = int(match[q, 0])
             rho_j, alpha_j, p_j = oriented(lines, j)
+            c_j = oriented_shared(lines, j)
             x, y = match[q, 2], match[q, 3]
             if target < 0:
-                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+                common = product(seen_by, c_j.T)
                 target = j
-            elif not told_apart(lines, target, j) and distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
+            else:
+                # what two lines of the map share they share by the pose, as far as is known
+                common = product(product(c0, pose_information), c_j.T)
+                if told_apart(lines, target, j) or not (
+                    distance2_shared(r0, a0, p0, rho_j, alpha_j, p_j, common, x, y) < gate
+                ):
+                    continue
                 lines.fed[target] = np.maximum(lines.fed[target], lines.fed[j])
-                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+            r0, a0, p0, old, new = fuse(r0, a0, p0, rho_j, alpha_j, p_j, common, x, y)
+            c0 = product(old, c0) + product(new, c_j)
+            if j != target:
                 free_line(lines, slots, j)
                 # its rows become fresh pieces of the target below
                 row = lines.first[j]
@@ -464,7 +497,7 @@ def insert(
                     if best[k] == target:
                         best[k] = -1
             lines.born[target] = stamp
-        store(lines, target, r0, a0, p0)
+        store(lines, target, r0, a0, p0, c0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
         clear_covered(target, rows, lines, grid, slots, sigma_range, door, found)
 
