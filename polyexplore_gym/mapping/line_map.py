@@ -87,7 +87,8 @@ class LineMap:
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
-            self.config.grouping, drifting, pose[:2] - self._pose[:2], information, self._rows, self._lines, self._grid, slots,
+            self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
+            self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
         self._pose = pose.copy()
         touched = np.sort(slots.touched[: slots.counts[3]])
@@ -140,8 +141,8 @@ class LineMap:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(N, 2, 2) covariance of each line in the order (alpha, rho)."""
-        return self._lines.covariance[: self._line_count]
+        """(N, 2, 2) covariance of each line in the order (alpha, rho): of the line, and of its walls about it."""
+        return self._lines.covariance[: self._line_count] + self._lines.spread[: self._line_count]
 
     @property
     def line_alive(self) -> np.ndarray:
@@ -227,4 +228,6 @@ def _lines(n: int) -> Lines:
         np.zeros((n, MEMORY), np.int64),
         np.zeros(n, np.int64),
         np.zeros((n, 2, 3)),
+        np.zeros((n, 3)),
+        np.zeros((n, 2, 2)),
     )

@@ -52,7 +52,11 @@ class Lines(NamedTuple):
     born: np.ndarray
     """Number of the insert that put the line there."""
     shared: np.ndarray
-    """(N, 2, 3) E[e_line e_pose'], of (alpha, rho) and the pose of the last insert; 0 where that pose's error is new."""
+    """(N, 2, 3) E[e_line e_pose'] of (alpha, rho) and the pose of the last insert; 0 if that pose's error is new."""
+    misfit: np.ndarray
+    """(N, 3) fusions, the sum of their chi-squares, and how much that would grow with 1 m2 of `merge.unevenness`."""
+    spread: np.ndarray
+    """(N, 2, 2) covariance of what walls on the line are off the line beside `covariance`."""
 
 
 class Slots(NamedTuple):
@@ -110,7 +114,7 @@ def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray, shared:
 
 @njit(cache=True)
 def carry(lines: Lines, dx: float, dy: float) -> None:
-    """Take what lines share with the pose along a way of (dx, dy): C <- C F', F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]."""
+    """Take what lines share with the pose along a way: C <- C F' with F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]."""
     for i in range(lines.alive.size):
         if lines.alive[i]:
             for k in range(2):

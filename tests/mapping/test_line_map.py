@@ -450,7 +450,7 @@ def test_index_and_brute_force_find_the_same_partners():
             line = to_map(lines.rho[i], lines.alpha[i], lines.covariance[i], pose, EXACT)
             n, _ = candidates(
                 *line, placed, lines.segment_line, i, line_map._rows, line_map._lines, line_map._grid,
-                line_map.config.merge_gate, line_map.config.door_width, 10**9, -1, found, out,
+                line_map.config.merge_gate, line_map.config.door_width, 10**9, -1, np.zeros((2, 3)), False, found, out,
             )  # fmt: skip
             expected = brute_force(line_map, *line, placed[lines.segment_line == i])
             # the index may offer a few lines more, whose rows lie just outside the box
