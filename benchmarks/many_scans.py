@@ -38,7 +38,7 @@ from tqdm import tqdm
 
 from baselines import make_policy
 from polyexplore_gym.config import EnvConfig, MappingConfig, PoseConfig, SensorConfig, from_mapping
-from polyexplore_gym.env import PolyExploreEnv
+from polyexplore_gym.env import PolyExploreEnv, _with_stops
 from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.floorplan import FloorPlan, load_plan, suite
 from polyexplore_gym.mapping import LineMap, Localizer, ScanLines, extract_lines
@@ -99,13 +99,30 @@ def follow(plan: FloorPlan, poses: list[np.ndarray], mode: str, seed: int) -> Ma
     mapping = MappingConfig().resolved(RADIUS)
     out = Mapped(LineMap(mapping, sensor), Localizer() if mode == "slam" else None)
     for trajectory in poses:
-        model.moved(trajectory)
         true = trajectory[-1]
+        drive(out, plan, laser, model, trajectory, rng)
         ranges = laser.measure(plan.segments, true, rng)
         lines = extract_lines(laser.angles, ranges, sensor, mapping)
         insert(out, lines, model, true, mode)
         note(out, plan, true, model.estimate)
     return out
+
+
+def drive(
+    mapped: Mapped, plan: FloorPlan, laser: Laser, model: PoseModel, trajectory: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Move on; in the mode slam the pose is also corrected in turns, as the environment does."""
+    done = 0
+    if mapped.localizer is not None:
+        trajectory, stops = _with_stops(trajectory, model.config.correct_every, turns=True)
+        for stop in stops:
+            model.moved(trajectory[done : stop + 1])
+            ranges = laser.measure(plan.segments, trajectory[stop], rng)
+            lines = extract_lines(laser.angles, ranges, laser.config, mapped.line_map.config)
+            fix = mapped.localizer.correct(lines, mapped.line_map, *model.measured(trajectory[stop]))
+            model.correct(fix.pose, fix.covariance)
+            done = stop
+    model.moved(trajectory[done:])
 
 
 def insert(mapped: Mapped, lines: ScanLines, model: PoseModel, true: np.ndarray, mode: str) -> None:
@@ -292,7 +309,7 @@ def long_run(plan: FloorPlan, every: float, scans: int, mode: str) -> None:
     mapped = Mapped(LineMap(mapping, sensor), Localizer() if mode == "slam" else None)
     rows, spent, before = [], np.zeros(2), 0
     for k, trajectory in enumerate(poses):
-        model.moved(trajectory)
+        drive(mapped, plan, laser, model, trajectory, rng)
         ranges = laser.measure(plan.segments, trajectory[-1], rng)
         begin = time.thread_time()
         lines = extract_lines(laser.angles, ranges, sensor, mapping)
