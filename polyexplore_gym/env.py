@@ -363,7 +363,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         pose = self._world.pose
         ranges, found, fix = self._scan_lines(pose)
         scan = Scan(self._world.laser.angles, ranges, fix.pose, fix.covariance, self.config.sensor.full_circle)
-        touched = self._lines.insert(found, fix.pose, fix.relative)
+        drifting = self.config.pose.mode == "odometry"
+        touched = self._lines.insert(found, fix.pose, fix.relative, drifting=drifting)
         if self._localizer is not None:
             self._localizer.learn(self._lines)
         self._exploration.insert(

@@ -150,32 +150,90 @@ def distance2(
 
 
 @njit(cache=True)
-def fuse(
-    rho1: float, alpha1: float, p1: np.ndarray, rho2: float, alpha2: float, p2: np.ndarray, x: float, y: float
-) -> tuple[float, float, np.ndarray]:
-    """Information-form mean of two independent estimates of one line, worked out at (x, y).
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a b; for matrices of two and three rows quicker than BLAS."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            if a[i, k] != 0.0:
+                for j in range(b.shape[1]):
+                    out[i, j] += a[i, k] * b[k, j]
+    return out
 
-    P = (P1^-1 + P2^-1)^-1, L = P (P1^-1 L1 + P2^-1 L2) = L1 + P1 (P1 + P2)^-1 (L2 - L1).
+
+@njit(cache=True)
+def by_pose(alpha: float, pose: np.ndarray) -> np.ndarray:
+    """K of `to_map`: (2, 3) derivatives of a line (alpha, rho) in the map frame by the pose that it was seen from."""
+    out = np.zeros((2, 3))
+    c, s = math.cos(alpha), math.sin(alpha)
+    out[0, 2], out[1, 0], out[1, 1], out[1, 2] = 1.0, c, s, pose[1] * c - pose[0] * s
+    return out
+
+
+@njit(cache=True)
+def lever(alpha: float, x: float, y: float) -> np.ndarray:
+    """(2, 2) from the errors (alpha, rho) of a line to those of (alpha, offset) in a frame moved to (x, y)."""
+    out = np.eye(2)
+    out[1, 0] = x * math.sin(alpha) - y * math.cos(alpha)
+    return out
+
+
+@njit(cache=True)
+def difference(
+    alpha1: float, p1: np.ndarray, alpha2: float, p2: np.ndarray, shared: np.ndarray, x: float, y: float
+) -> np.ndarray:
+    """Covariance of the difference of two lines at (x, y): P1 + P2 - X - X' with X = E[e1 e2']."""
+    t1, t2 = lever(alpha1, x, y), lever(alpha2, x, y)
+    cross = product(product(t1, shared), t2.T)
+    return product(product(t1, p1), t1.T) + product(product(t2, p2), t2.T) - cross - cross.T
+
+
+@njit(cache=True)
+def distance2_shared(
+    rho1: float, alpha1: float, p1: np.ndarray, rho2: float, alpha2: float, p2: np.ndarray, shared: np.ndarray,
+    x: float, y: float,
+) -> float:  # fmt: skip
+    """As `distance2`, for lines whose errors have the covariance `shared` = E[e1 e2'] (2, 2)."""
+    s = difference(alpha1, p1, alpha2, p2, shared, x, y)
+    det = s[0, 0] * s[1, 1] - s[0, 1] * s[0, 1]
+    if not (det > 0.0 and s[0, 0] > 0.0):
+        return math.inf
+    da = wrap(alpha1 - alpha2)
+    do = rho1 - x * math.cos(alpha1) - y * math.sin(alpha1) - rho2 + x * math.cos(alpha2) + y * math.sin(alpha2)
+    return (s[1, 1] * da * da - 2.0 * s[0, 1] * da * do + s[0, 0] * do * do) / det
+
+
+@njit(cache=True)
+def fuse(
+    rho1: float, alpha1: float, p1: np.ndarray, rho2: float, alpha2: float, p2: np.ndarray, shared: np.ndarray,
+    x: float, y: float,
+) -> tuple[float, float, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """The mean of two estimates of one line with the least variance, worked out at (x, y).
+
+    With X = E[e1 e2'] = `shared` (2, 2), S = P1 + P2 - X - X' and the gain G = (P1 - X) S^-1:
+    L = L1 + G (L2 - L1), P = (I - G) P1 (I - G)' + G P2 G' + (I - G) X G' + G X' (I - G)'. Without X that is the
+    information form P = (P1^-1 + P2^-1)^-1, L = P (P1^-1 L1 + P2^-1 L2).
+
+    Returns rho, alpha, P, and what the error of the mean is made of: e = A e1 + B e2.
     """
-    o1, b1, c1 = shift(rho1, alpha1, p1[0, 0], p1[0, 1], p1[1, 1], x, y)
-    o2, b2, c2 = shift(rho2, alpha2, p2[0, 0], p2[0, 1], p2[1, 1], x, y)
-    a1, a2 = p1[0, 0], p2[0, 0]
-    a, b, c = a1 + a2, b1 + b2, c1 + c2
-    det = a * c - b * b
-    # gain P1 (P1 + P2)^-1
-    g00, g01 = (a1 * c - b1 * b) / det, (b1 * a - a1 * b) / det
-    g10, g11 = (b1 * c - c1 * b) / det, (c1 * a - b1 * b) / det
-    da, do = wrap(alpha2 - alpha1), o2 - o1
-    alpha = alpha1 + g00 * da + g01 * do
-    offset = o1 + g10 * da + g11 * do
-    # P = gain P2, symmetrised
-    paa = g00 * a2 + g01 * b2
-    par = 0.5 * (g00 * b2 + g01 * c2 + g10 * a2 + g11 * b2)
-    prr = g10 * b2 + g11 * c2
+    t1, t2 = lever(alpha1, x, y), lever(alpha2, x, y)
+    q1, q2 = product(product(t1, p1), t1.T), product(product(t2, p2), t2.T)
+    cross = product(product(t1, shared), t2.T)
+    s = q1 + q2 - cross - cross.T
+    det = s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
+    inverse = np.empty((2, 2))
+    inverse[0, 0], inverse[0, 1], inverse[1, 0], inverse[1, 1] = s[1, 1], -s[0, 1], -s[1, 0], s[0, 0]
+    gain = product(q1 - cross, inverse) / det
+    da = wrap(alpha2 - alpha1)
+    o1 = rho1 - x * math.cos(alpha1) - y * math.sin(alpha1)
+    do = rho2 - x * math.cos(alpha2) - y * math.sin(alpha2) - o1
+    alpha = alpha1 + gain[0, 0] * da + gain[0, 1] * do
+    rho = o1 + gain[1, 0] * da + gain[1, 1] * do + x * math.cos(alpha) + y * math.sin(alpha)
     # back to the frame's own origin
-    rho, par0, prr0 = shift(offset, alpha, paa, par, prr, -x, -y)
-    out = np.empty((2, 2))
-    out[0, 0] = paa
-    out[0, 1] = out[1, 0] = par0
-    out[1, 1] = prr0
-    return rho, wrap(alpha), out
+    back = lever(alpha, x, y)
+    back[1, 0] = -back[1, 0]
+    a, b = product(back, product(np.eye(2) - gain, t1)), product(back, product(gain, t2))
+    half = product(product(a, shared), b.T)
+    p = product(product(a, p1), a.T) + product(product(b, p2), b.T) + half + half.T
+    p[0, 1] = p[1, 0] = 0.5 * (p[0, 1] + p[1, 0])
+    return rho, wrap(alpha), p, a, b

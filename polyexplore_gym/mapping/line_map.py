@@ -43,6 +43,7 @@ class LineMap:
         self._var_range = max(self.sensor.sigma_range, self.config.range_floor, LEAST_RANGE_NOISE * self._door) ** 2
         self._var_angle = max(self.sensor.sigma_angle, LEAST_ANGLE_NOISE) ** 2
         self._row_count = self._line_count = 0
+        self._pose = np.zeros(3)
         self._rows, self._lines = _rows(256), _lines(128)
         self._grid = empty_grid(256, 2.0 * self._door)
         self._slots = Slots(
@@ -54,13 +55,17 @@ class LineMap:
         )
         self._release(0, 256, 0, 128)
 
-    def insert(self, lines: ScanLines, pose: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    def insert(
+        self, lines: ScanLines, pose: np.ndarray, covariance: np.ndarray, *, drifting: bool = False
+    ) -> np.ndarray:
         """Insert the lines and fragments of one scan.
 
         Args:
             lines: of `extract_lines`.
             pose: (3,) estimated x, y (m), heading (rad) of the scan in the map frame.
             covariance: (3, 3) covariance of the pose, m2, m rad, rad2.
+            drifting: whether the pose was reckoned from that of the insert before, so that its error is the error of
+                that one and what the way added. Otherwise the errors of two poses have nothing in common.
 
         Returns:
             Rows added, changed (an end moved by 0.4 % of a door's width or more) or removed, ascending.
@@ -76,11 +81,16 @@ class LineMap:
             raise ValueError(f"pose and covariance must be finite, got {pose} and {covariance}")
         self._reserve(lines.segments.shape[0] + lines.fragments.shape[0], lines.rho.size)
         slots = self._slots
+        if not drifting:
+            self._lines.shared[: self._line_count] = 0.0
+        information = np.linalg.pinv(covariance, hermitian=True) if drifting else np.zeros((3, 3))
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
-            self.config.grouping, self._rows, self._lines, self._grid, slots,
+            self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
+            self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
+        self._pose = pose.copy()
         touched = np.sort(slots.touched[: slots.counts[3]])
         if touched.size:
             self._row_count = max(self._row_count, int(touched[-1]) + 1)
@@ -131,8 +141,8 @@ class LineMap:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(N, 2, 2) covariance of each line in the order (alpha, rho)."""
-        return self._lines.covariance[: self._line_count]
+        """(N, 2, 2) covariance of each line in the order (alpha, rho): of the line, and of its walls about it."""
+        return self._lines.covariance[: self._line_count] + self._lines.spread[: self._line_count]
 
     @property
     def line_alive(self) -> np.ndarray:
@@ -217,4 +227,7 @@ def _lines(n: int) -> Lines:
         np.full(n, -1, np.int64),
         np.zeros((n, MEMORY), np.int64),
         np.zeros(n, np.int64),
+        np.zeros((n, 2, 3)),
+        np.zeros((n, 3)),
+        np.zeros((n, 2, 2)),
     )

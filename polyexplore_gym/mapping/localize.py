@@ -41,7 +41,8 @@ import numpy as np
 from numba import njit
 
 from polyexplore_gym.mapping.extract import ScanLines
-from polyexplore_gym.mapping.fit import wrap
+from polyexplore_gym.mapping.fit import by_pose as seen_by
+from polyexplore_gym.mapping.fit import product, wrap
 from polyexplore_gym.mapping.grid import Grid
 from polyexplore_gym.mapping.line_map import LineMap
 from polyexplore_gym.mapping.merge import MAX_TURN, box_query, interval_gap
@@ -167,6 +168,15 @@ class Localizer:
         values, vectors = np.linalg.eigh(0.5 * (out + out.T))
         return (vectors * np.maximum(values, 0.0)) @ vectors.T
 
+    def covariance(self, line_map: LineMap) -> np.ndarray:
+        """(N, 2, 2) covariance of each line (alpha, rho) in the frame of the start; that of `LineMap` is relative."""
+        n = line_map.rho.size
+        out = np.zeros((n, 2, 2))
+        for i, k in np.ndindex(2, 2):
+            out[:, i, k] = np.diagonal(self._lines[i : 2 * n : 2, k : 2 * n : 2])
+        out[line_map.line_side < 0] *= [[1.0, -1.0], [-1.0, 1.0]]
+        return out + line_map.tables[1].spread[:n]
+
     def learn(self, line_map: LineMap) -> None:
         """Follow what the insertion made of the lines; once after each insert."""
         table = line_map.tables[1]
@@ -205,18 +215,6 @@ def _seen_from(pose: np.ndarray, rho: float, alpha: float) -> tuple[float, float
 
 
 @njit(cache=True)
-def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a b; for matrices of two and three rows quicker than BLAS."""
-    out = np.zeros((a.shape[0], b.shape[1]))
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            if a[i, k] != 0.0:
-                for j in range(b.shape[1]):
-                    out[i, j] += a[i, k] * b[k, j]
-    return out
-
-
-@njit(cache=True)
 def _inverse(a: np.ndarray) -> np.ndarray:
     """Of a (2, 2) matrix."""
     out = np.empty((2, 2))
@@ -234,8 +232,8 @@ def _innovation(
     rho_j, alpha_j, _ = oriented(table, j)
     rho_e, alpha_e, by_pose, by_line = _seen_from(pose, rho_j, alpha_j)
     c, own = np.ascontiguousarray(shared[:, 2 * j : 2 * j + 2]), lines[2 * j : 2 * j + 2, 2 * j : 2 * j + 2].copy()
-    cross = _times(_times(by_pose, c), by_line.T)
-    s = _times(_times(by_pose, p), by_pose.T) + cross + cross.T + _times(_times(by_line, own), by_line.T) + r
+    cross = product(product(by_pose, c), by_line.T)
+    s = product(product(by_pose, p), by_pose.T) + cross + cross.T + product(product(by_line, own), by_line.T) + r
     v = np.empty((2, 1))
     v[0, 0], v[1, 0] = wrap(alpha - alpha_e), rho - rho_e
     det = s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0]
@@ -327,23 +325,23 @@ def _correct(
         if j < 0:
             continue
         v, s, by_pose, by_line, _ = _innovation(rho[i], alpha[i], covariance[i], j, pose, p, shared, lines, table)
-        t = _times(by_pose, p) + _times(by_line, np.ascontiguousarray(shared[:, 2 * j : 2 * j + 2].T))
-        u = _times(by_pose, shared) + _times(by_line, lines[2 * j : 2 * j + 2])
-        gain = _times(np.ascontiguousarray(t.T), _inverse(s))
-        step = _times(gain, v)
+        t = product(by_pose, p) + product(by_line, np.ascontiguousarray(shared[:, 2 * j : 2 * j + 2].T))
+        u = product(by_pose, shared) + product(by_line, lines[2 * j : 2 * j + 2])
+        gain = product(np.ascontiguousarray(t.T), _inverse(s))
+        step = product(gain, v)
         for a in range(3):
             pose[a] += step[a, 0]
         pose[2] = wrap(pose[2])
-        p -= _times(gain, t)
+        p -= product(gain, t)
         for a in range(3):
             for b in range(a):
                 p[a, b] = p[b, a] = 0.5 * (p[a, b] + p[b, a])
-        shared -= _times(gain, u)
-        back = _times(gain, by_pose)
+        shared -= product(gain, u)
+        back = product(gain, by_pose)
         for k in range(matched.size):
             if matched[k] >= 0:
-                noise[k] -= _times(back, noise[k])
-        noise[i] = -_times(gain, covariance[i])
+                noise[k] -= product(back, noise[k])
+        noise[i] = -product(gain, covariance[i])
         matched[i] = j
 
 
@@ -377,16 +375,13 @@ def _learn(
     for a in range(n):
         j = active[a]
         _, alpha, now = oriented(table, j)
-        c, s = math.cos(alpha), math.sin(alpha)
-        h = pose[1] * c - pose[0] * s
-        k = np.zeros((2, 3))
-        k[0, 2], k[1, 0], k[1, 1], k[1, 2] = 1.0, c, s, h
+        k = seen_by(alpha, pose)
         if table.born[j] == born[j]:
-            keep[a] = _times(now, _inverse(fused[j]))
+            keep[a] = product(now, _inverse(fused[j]))
         gain = np.eye(2) - keep[a]
-        by_pose[a] = _times(gain, k)
+        by_pose[a] = product(gain, k)
         turn = np.eye(2)
-        turn[1, 0] = h
+        turn[1, 0] = k[1, 2]
         # scan lines matched with this one count as one, the mean weighted by information
         seen = 0
         weight, v = np.zeros((2, 2)), np.zeros((3, 2))
@@ -394,33 +389,33 @@ def _learn(
             if matched[i] == j:
                 information = _inverse(covariance[i])
                 weight += information
-                v += _times(noise[i], information)
+                v += product(noise[i], information)
                 seen += 1
         if seen > 0:
             r = _inverse(weight)
-            moved = _times(gain, turn)
-            own[a] = _times(_times(moved, r), moved.T)
-            with_pose[a] = -_times(moved, _times(r, np.ascontiguousarray(v.T)))
+            moved = product(gain, turn)
+            own[a] = product(product(moved, r), moved.T)
+            with_pose[a] = -product(moved, product(r, np.ascontiguousarray(v.T)))
         else:
-            own[a] = _not_negative(_times(now, gain.T) - _times(_times(by_pose[a], relative), by_pose[a].T))
+            own[a] = _not_negative(product(now, gain.T) - product(product(by_pose[a], relative), by_pose[a].T))
         fused[j], born[j] = now, table.born[j]
 
     # what the changed lines share with each other, then with the rest, then with the pose
     among = np.empty((n, n, 2, 2))
     for a in range(n):
         j = 2 * active[a]
-        to_pose = _times(keep[a], np.ascontiguousarray(shared[:, j : j + 2].T)) + _times(by_pose[a], p)
+        to_pose = product(keep[a], np.ascontiguousarray(shared[:, j : j + 2].T)) + product(by_pose[a], p)
         for b in range(a + 1):
             q = 2 * active[b]
-            m = _times(_times(keep[a], lines[j : j + 2, q : q + 2].copy()), keep[b].T)
-            m += _times(to_pose + with_pose[a], by_pose[b].T) + _times(by_pose[a], with_pose[b].T)
-            m += _times(_times(by_pose[a], np.ascontiguousarray(shared[:, q : q + 2])), keep[b].T)
+            m = product(product(keep[a], lines[j : j + 2, q : q + 2].copy()), keep[b].T)
+            m += product(to_pose + with_pose[a], by_pose[b].T) + product(by_pose[a], with_pose[b].T)
+            m += product(product(by_pose[a], np.ascontiguousarray(shared[:, q : q + 2])), keep[b].T)
             if a == b:
                 m += own[a]
             among[a, b], among[b, a] = m, m.T
     for a in range(n):
         j = 2 * active[a]
-        row = _times(keep[a], lines[j : j + 2, : 2 * count].copy()) + _times(by_pose[a], shared[:, : 2 * count])
+        row = product(keep[a], lines[j : j + 2, : 2 * count].copy()) + product(by_pose[a], shared[:, : 2 * count])
         lines[j : j + 2, : 2 * count] = row
         lines[: 2 * count, j : j + 2] = row.T
     for a in range(n):
@@ -428,5 +423,5 @@ def _learn(
         for b in range(n):
             q = 2 * active[b]
             lines[j : j + 2, q : q + 2] = among[a, b]
-        column = _times(keep[a], np.ascontiguousarray(shared[:, j : j + 2].T)) + _times(by_pose[a], p) + with_pose[a]
+        column = product(keep[a], np.ascontiguousarray(shared[:, j : j + 2].T)) + product(by_pose[a], p) + with_pose[a]
         shared[:, j : j + 2] = column.T

@@ -7,19 +7,31 @@ import math
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.mapping.fit import distance2, fuse, to_map, wrap
+from polyexplore_gym.mapping.fit import (
+    by_pose,
+    difference,
+    distance2,
+    distance2_shared,
+    fuse,
+    lever,
+    product,
+    to_map,
+    wrap,
+)
 from polyexplore_gym.mapping.grid import Grid, grid_query
 from polyexplore_gym.mapping.slots import (
     MEMORY,
     Lines,
     Rows,
     Slots,
+    carry,
     facing,
     feed,
     free_line,
     free_row,
     new_row,
     oriented,
+    oriented_shared,
     publish,
     store,
     told_apart,
@@ -33,6 +45,10 @@ COVER = 0.08  # what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.2  # pieces of one line are joined across this + 3 sigma, at most half a door
 LEAST_PIECE = 0.02  # shorter pieces on a line are widened to this
 LEAST_END = 0.01  # smallest standard deviation kept for a segment's end along its line
+DISAGREEMENT = 2.0  # sum of chi-squares so many standard deviations too large: what was fused is not one straight wall
+STRAIGHT = (
+    6e-4  # walls that count as one stay so near to their line (0.3 mm at 0.5 m: whole millimetres, as in drawings)
+)
 CLOSE_LOOK = 0.1  # how densely it is looked at what of a segment is known
 
 
@@ -95,11 +111,14 @@ def candidates(
     door: float,
     stamp: int,
     own: int,
+    seen_by: np.ndarray,
+    drifting: bool,
     found: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, bool]:
     """Map lines that pass the merge test with new line i (map frame): the best first.
 
+    seen_by (2, 3): K of the new line; with `drifting` lines may share an error with the pose that it was seen from.
     Each row of `out` is line slot, d2, x, y of the middle between the pieces compared. What another line of the
     scan feeds (in insert `stamp`) is left out, but for `own`. Returns their number, and whether it is clear which
     one it is: not so if a scan told the best and another one apart.
@@ -125,7 +144,11 @@ def candidates(
                 continue
             rho_j, alpha_j, p_j = oriented(lines, j)
             x, y = 0.25 * (s[0] + s[2] + r[0] + r[2]), 0.25 * (s[1] + s[3] + r[1] + r[3])
-            d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
+            if drifting:
+                common = product(seen_by, oriented_shared(lines, j).T)
+                d2 = distance2_shared(rho, alpha, p, rho_j, alpha_j, p_j, common, x, y)
+            else:
+                d2 = distance2(rho, alpha, p, rho_j, alpha_j, p_j, x, y)
             if d2 < gate:
                 at = count
                 while at > 0 and (out[at - 1, 1] > d2 or (out[at - 1, 1] == d2 and out[at - 1, 0] > j)):
@@ -313,6 +336,59 @@ def covered(
 
 
 @njit(cache=True)
+def extent(segments: np.ndarray, of: np.ndarray, i: int, alpha: float) -> tuple[float, float]:
+    """Where the pieces of line i begin and end along the line of normal alpha, m."""
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    low, high = math.inf, -math.inf
+    for k in range(of.size):
+        if of[k] == i:
+            for e in range(0, 4, 2):
+                t = segments[k, e + 1] * ca - segments[k, e] * sa
+                low, high = min(low, t), max(high, t)
+    return low, high
+
+
+@njit(cache=True)
+def sensitivity(s: np.ndarray, length: float) -> float:
+    """By how much an unevenness of 1 m2 makes the expected chi-square of a difference with covariance s larger."""
+    return (12.0 / (length * length) * s[1, 1] + s[0, 0]) / (s[0, 0] * s[1, 1] - s[0, 1] * s[0, 1])
+
+
+@njit(cache=True)
+def unevenness(misfit: np.ndarray, gate: float, door: float) -> float:
+    """Variance of walls about the line that they were fused to, m2: `STRAIGHT`, unless the scans disagree by more.
+
+    A random-effects model: what a scan shows of a line of length l is off it by tau across and by tau sqrt(12) / l in
+    direction, anew for every wall or place, beside the noise. Estimated by moments from the chi-squares Q of the n
+    fusions, as DerSimonian and Laird do (Controlled Clinical Trials 7, 1986). Of those only what passed the gate is
+    there, which lowers the mean of 2 by g q / (1 - q), q = exp(-g / 2).
+    """
+    q = math.exp(-0.5 * gate)
+    excess = misfit[1] - misfit[0] * (2.0 - gate * q / (1.0 - q))
+    least = (STRAIGHT * door) ** 2
+    return max(excess / misfit[2], least) if excess > DISAGREEMENT * 2.0 * math.sqrt(misfit[0]) else least
+
+
+@njit(cache=True)
+def spread_out(line: int, variance: float, rows: Rows, lines: Lines) -> None:
+    """Write `spread` of a line whose walls are uneven by variance, m2, about the middle of what is known of it."""
+    alpha = lines.alpha[line]
+    ca, sa = math.cos(alpha), math.sin(alpha)
+    low, high = math.inf, -math.inf
+    row = lines.first[line]
+    while row >= 0:
+        e = rows.ends[row]
+        a, b = e[1] * ca - e[0] * sa, e[3] * ca - e[2] * sa
+        low, high = min(low, a, b), max(high, a, b)
+        row = rows.next[row]
+    middle = 0.5 * (low + high)
+    t = lever(alpha, middle * sa, -middle * ca)  # from the middle back to the origin
+    local = np.zeros((2, 2))
+    local[0, 0], local[1, 1] = 12.0 * variance / (high - low) ** 2, variance
+    lines.spread[line] = product(product(t, local), t.T)
+
+
+@njit(cache=True)
 def fused_in_scan(
     i: int, j: int, segments: np.ndarray, of: np.ndarray, rho: np.ndarray, alpha: np.ndarray, covariance: np.ndarray,
     gate: float,
@@ -327,7 +403,9 @@ def fused_in_scan(
     x, y = x / pieces, y / pieces
     if distance2(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y) >= gate:
         return False
-    rho[i], alpha[i], covariance[i] = fuse(rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], x, y)
+    rho[i], alpha[i], covariance[i], _, _ = fuse(
+        rho[i], alpha[i], covariance[i], rho[j], alpha[j], covariance[j], np.zeros((2, 2)), x, y
+    )
     of[of == j] = i
     return True
 
@@ -347,6 +425,9 @@ def insert(
     gate: float,
     door: float,
     grouping: bool,
+    drifting: bool,
+    moved: np.ndarray,
+    pose_information: np.ndarray,
     rows: Rows,
     lines: Lines,
     grid: Grid,
@@ -355,7 +436,11 @@ def insert(
     """Insert one scan's lines and fragments; the touched rows are left in `slots`.
 
     Without grouping the lines are taken one by one, as if each came from a scan of its own.
+    With `drifting` the pose's error is that of the last insert, carried along the way `moved` (2,), and what the way
+    added; pose_information (3, 3) is the (pseudo-)inverse of its covariance.
     """
+    if drifting:
+        carry(lines, moved[0], moved[1])
     slots.counts[2] += 1
     slots.counts[3] = 0
     stamp = slots.counts[2]
@@ -388,7 +473,10 @@ def insert(
         i = first
         while i >= 0:
             r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
-            count, clear = candidates(r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, -1, found, match)
+            count, clear = candidates(
+                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, -1, by_pose(a0, pose), drifting,
+                found, match,
+            )  # fmt: skip
             looking, i = i, -1
             for q in range(count if clear else 0):
                 j, d2 = int(match[q, 0]), match[q, 1]
@@ -413,21 +501,38 @@ def insert(
         if best[i] == -2:
             continue
         r0, a0, p0 = to_map(rho[i], alpha[i], covariance[i], pose, pose_covariance)
+        seen_by = by_pose(a0, pose)
+        c0 = product(seen_by, pose_covariance) if drifting else np.zeros((2, 3))
+        low, high = extent(placed[:, :4], of, i, a0)
+        misfit = np.zeros(3)
         target, count = -1, 0
         if best[i] >= 0:
             count, _ = candidates(
-                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, best[i], found, match
-            )
+                r0, a0, p0, placed, of, i, rows, lines, grid, gate, door, stamp, best[i], seen_by, drifting,
+                found, match,
+            )  # fmt: skip
         for q in range(count):
             j = int(match[q, 0])
             rho_j, alpha_j, p_j = oriented(lines, j)
+            c_j = oriented_shared(lines, j)
             x, y = match[q, 2], match[q, 3]
             if target < 0:
-                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+                common, d2 = product(seen_by, c_j.T), match[q, 1]
                 target = j
-            elif not told_apart(lines, target, j) and distance2(r0, a0, p0, rho_j, alpha_j, p_j, x, y) < gate:
+            else:
+                # what two lines of the map share they share by the pose, as far as is known
+                common = product(product(c0, pose_information), c_j.T)
+                d2 = distance2_shared(r0, a0, p0, rho_j, alpha_j, p_j, common, x, y)
+                if told_apart(lines, target, j) or not d2 < gate:
+                    continue
                 lines.fed[target] = np.maximum(lines.fed[target], lines.fed[j])
-                r0, a0, p0 = fuse(r0, a0, p0, rho_j, alpha_j, p_j, x, y)
+            misfit += lines.misfit[j]
+            misfit[0] += 1.0
+            misfit[1] += d2
+            misfit[2] += sensitivity(difference(a0, p0, alpha_j, p_j, common, x, y), high - low)
+            r0, a0, p0, old, new = fuse(r0, a0, p0, rho_j, alpha_j, p_j, common, x, y)
+            c0 = product(old, c0) + product(new, c_j)
+            if j != target:
                 free_line(lines, slots, j)
                 # its rows become fresh pieces of the target below
                 row = lines.first[j]
@@ -464,8 +569,10 @@ def insert(
                     if best[k] == target:
                         best[k] = -1
             lines.born[target] = stamp
-        store(lines, target, r0, a0, p0)
+        store(lines, target, r0, a0, p0, c0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
+        lines.misfit[target] = misfit
+        spread_out(target, unevenness(misfit, gate, door), rows, lines)
         clear_covered(target, rows, lines, grid, slots, sigma_range, door, found)
 
     piece = np.empty(4)

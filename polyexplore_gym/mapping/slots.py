@@ -51,6 +51,12 @@ class Lines(NamedTuple):
     """(N, MEMORY) numbers of inserts with a line of their scan for this one, each in the column number % MEMORY."""
     born: np.ndarray
     """Number of the insert that put the line there."""
+    shared: np.ndarray
+    """(N, 2, 3) E[e_line e_pose'] of (alpha, rho) and the pose of the last insert; 0 if that pose's error is new."""
+    misfit: np.ndarray
+    """(N, 3) fusions, the sum of their chi-squares, and how much that would grow with 1 m2 of `merge.unevenness`."""
+    spread: np.ndarray
+    """(N, 2, 2) covariance of what walls on the line are off the line beside `covariance`."""
 
 
 class Slots(NamedTuple):
@@ -84,15 +90,37 @@ def oriented(lines: Lines, i: int) -> tuple[float, float, np.ndarray]:
 
 
 @njit(cache=True)
-def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray) -> None:
+def oriented_shared(lines: Lines, i: int) -> np.ndarray:
+    """(2, 3) `Lines.shared` of the line as `oriented` gives it."""
+    out = lines.shared[i].copy()
+    if lines.side[i] < 0:
+        out[1] = -out[1]
+    return out
+
+
+@njit(cache=True)
+def store(lines: Lines, i: int, rho: float, alpha: float, p: np.ndarray, shared: np.ndarray) -> None:
     """Write an oriented line into its slot with rho >= 0 and the side it was seen from."""
     lines.covariance[i, 0, 0], lines.covariance[i, 1, 1] = p[0, 0], p[1, 1]
+    lines.shared[i] = shared
     if rho < 0.0:
         lines.rho[i], lines.alpha[i], lines.side[i] = -rho, wrap(alpha + math.pi), -1
         lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = -p[0, 1]
+        lines.shared[i, 1] = -shared[1]
     else:
         lines.rho[i], lines.alpha[i], lines.side[i] = rho, wrap(alpha), 1
         lines.covariance[i, 0, 1] = lines.covariance[i, 1, 0] = p[0, 1]
+
+
+@njit(cache=True)
+def carry(lines: Lines, dx: float, dy: float) -> None:
+    """Take what lines share with the pose along a way: C <- C F' with F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]."""
+    for i in range(lines.alive.size):
+        if lines.alive[i]:
+            for k in range(2):
+                turn = lines.shared[i, k, 2]
+                lines.shared[i, k, 0] -= dy * turn
+                lines.shared[i, k, 1] += dx * turn
 
 
 @njit(cache=True)

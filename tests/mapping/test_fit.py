@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.mapping import extract_lines
-from polyexplore_gym.mapping.fit import distance2, fit, fuse, normal_variance, shift, to_map, wrap
+from polyexplore_gym.mapping.fit import distance2, distance2_shared, fit, fuse, normal_variance, shift, to_map, wrap
 
 pytestmark = pytest.mark.bounds
 
@@ -134,12 +134,36 @@ def test_distance_and_fusion_are_the_information_form(seed):
     d = np.array([wrap(l1[0] - l2[0]), l1[1] - l2[1]])
     d2 = distance2(l1[1], l1[0], p1, l2[1], l2[0], p2, 0.0, 0.0)
     assert d2 == pytest.approx(d @ np.linalg.solve(p1 + p2, d), rel=1e-9)
-    rho, alpha, p = fuse(l1[1], l1[0], p1, l2[1], l2[0], p2, 0.0, 0.0)
+    rho, alpha, p, _, _ = fuse(l1[1], l1[0], p1, l2[1], l2[0], p2, np.zeros((2, 2)), 0.0, 0.0)
     i1, i2 = np.linalg.inv(p1), np.linalg.inv(p2)
     expected = np.linalg.inv(i1 + i2)
     np.testing.assert_allclose(p, expected, rtol=1e-8)
     mean = expected @ (i1 @ l1 + i2 @ (l1 - d))
     np.testing.assert_allclose([wrap(alpha - mean[0]), rho], [0, mean[1]], atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_lines_with_a_common_error_are_fused_with_the_least_variance(seed):
+    """Against generalised least squares with the whole covariance of both; at any place the same."""
+    rng = np.random.default_rng(seed)
+    joint = random_covariance(rng, 4, 0.02)
+    joint[:2, :2] += 1e-4 * np.eye(2)
+    p1, x, p2 = joint[:2, :2], joint[:2, 2:], joint[2:, 2:]
+    l1, l2 = np.array([0.7, 2.0]), np.array([0.7, 2.003])
+    h = np.vstack([np.eye(2), np.eye(2)])
+    expected = np.linalg.inv(h.T @ np.linalg.solve(joint, h))
+    mean = expected @ h.T @ np.linalg.solve(joint, np.concatenate([l1, l2]))
+    d = l1 - l2
+    for at in ((0.0, 0.0), (3.0, -2.0)):
+        rho, alpha, p, a, b = fuse(l1[1], l1[0], p1, l2[1], l2[0], p2, x, *at)
+        np.testing.assert_allclose(p, expected, rtol=0.02, atol=1e-7)
+        np.testing.assert_allclose([alpha, rho], mean, atol=1e-4)
+        both = np.hstack([a, b])
+        np.testing.assert_allclose(p, both @ joint @ both.T, rtol=1e-9)
+        d2 = distance2_shared(l1[1], l1[0], p1, l2[1], l2[0], p2, x, *at)
+        assert d2 == pytest.approx(d @ np.linalg.solve(p1 + p2 - x - x.T, d), rel=1e-6)
+    none = distance2_shared(l1[1], l1[0], p1, l2[1], l2[0], p2, np.zeros((2, 2)), 3.0, -2.0)
+    assert none == pytest.approx(distance2(l1[1], l1[0], p1, l2[1], l2[0], p2, 3.0, -2.0), rel=1e-9)
 
 
 def test_shift_there_and_back():

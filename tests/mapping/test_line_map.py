@@ -12,8 +12,8 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
 from polyexplore_gym.mapping.fit import to_map, wrap
 from polyexplore_gym.mapping.grid import empty_grid, grid_put, grid_query, grid_remove
-from polyexplore_gym.mapping.merge import candidates
-from polyexplore_gym.mapping.slots import oriented
+from polyexplore_gym.mapping.merge import STRAIGHT, candidates, unevenness
+from polyexplore_gym.mapping.slots import carry, oriented
 
 pytestmark = pytest.mark.bounds
 
@@ -292,6 +292,148 @@ def test_merged_lines_are_consistent():
     assert 1.75 < np.mean(values) < 2.4
 
 
+RING = np.array(box(0.0, 0.0, 9.0, 7.0) + [[x2, y2, x1, y1] for x1, y1, x2, y2 in box(2.0, 2.0, 7.0, 5.0)])
+
+
+def ring_way(scans):
+    """Poses (n, 3) round a ring of corridors, 0.25 m or half a radian apart."""
+    corners, target, out = np.array([[1.0, 1.0], [8.0, 1.0], [8.0, 6.0], [1.0, 6.0]]), 1, [np.array([2.0, 1.0, 0.0])]
+    while len(out) < scans:
+        pose = out[-1].copy()
+        ahead = corners[target] - pose[:2]
+        if np.hypot(*ahead) < 0.13:
+            target = (target + 1) % 4
+            continue
+        heading = math.atan2(ahead[1], ahead[0])
+        turn = wrap(heading - pose[2])
+        pose[2] = pose[2] + math.copysign(0.5, turn) if abs(turn) > 0.5 else heading
+        pose[:2] += 0.0 if abs(turn) > 0.5 else 0.25 * np.array([math.cos(heading), math.sin(heading)])
+        out.append(pose)
+    return np.array(out)
+
+
+def seen_often(walls, poses, mode, seed):
+    """A line map of scans from all the poses, under a pose error: none, one of its own each time, or a drift."""
+    rng, line_map = np.random.default_rng(seed), LineMap(sensor=SENSOR)
+    estimate, p = poses[0].copy(), np.zeros((3, 3))
+    for k, true in enumerate(poses):
+        if mode == "odometry" and k:
+            step, turn = true - poses[k - 1], estimate[2] - poses[k - 1, 2]
+            q = np.array([1.6e-5, 1.6e-5, 1e-5]) * np.hypot(*step[:2]) + np.array([0.0, 0.0, 4e-6 * abs(step[2])])
+            way = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ step[:2]
+            way += np.sqrt(q[:2]) * rng.standard_normal(2)
+            estimate += [*way, step[2] + math.sqrt(q[2]) * rng.standard_normal()]
+            move = np.eye(3)
+            move[0, 2], move[1, 2] = -way[1], way[0]
+            p = move @ p @ move.T + np.diag(q)
+        elif mode == "gaussian":
+            estimate, p = true + rng.normal(0.0, POSE_SIGMA), np.diag(POSE_SIGMA**2)
+        elif mode == "exact":
+            estimate = true
+        lines = extract_lines(HALF, measure(walls, true, SENSOR, rng), SENSOR)
+        line_map.insert(lines, estimate, p, drifting=mode == "odometry")
+    return line_map
+
+
+def long_lines(line_map, walls, spread=True):
+    """NEES of the lines with a segment of 1.5 m and more; with or without the part that stands for uneven walls."""
+    out = []
+    covariance = line_map.covariance if spread else line_map.tables[1].covariance
+    for j in np.flatnonzero(line_map.line_alive):
+        rows = line_map.segments[line_map.alive & (line_map.line == j)]
+        row = rows[np.argmax(np.hypot(*(rows[:, 2:] - rows[:, :2]).T))]
+        if math.dist(row[:2], row[2:]) < 1.5:
+            continue
+        at = 0.5 * (row[:2] + row[2:])
+        turn = np.arctan2(*(walls[:, 3:1:-1] - walls[:, 1::-1]).T) - math.atan2(row[3] - row[1], row[2] - row[0])
+        like = walls[np.abs(np.remainder(turn + math.pi, 2 * math.pi) - math.pi) < 0.5]
+        out.append(min(nees(line_map.rho[j], line_map.alpha[j], covariance[j], polar(w), at) for w in like))
+    return out
+
+
+@pytest.mark.parametrize(("mode", "low", "high"), [("exact", 1.5, 2.6), ("gaussian", 1.5, 3.0), ("odometry", 1.5, 2.8)])
+def test_walls_seen_a_hundred_times_keep_an_honest_covariance(mode, low, high):
+    """Under a drift, fused as if each pose had an error of its own, the NEES was 40."""
+    poses, values = ring_way(160), []
+    for seed in range(20):
+        values += long_lines(seen_often(RING, poses, mode, seed), RING, spread=False)
+    assert low < np.mean(values) < high
+    assert np.mean(np.array(values) > 13.8) < 0.04
+
+
+def test_what_lines_share_with_a_drifting_pose_is_their_covariance_with_it():
+    """Over many drives: the mean of e_line e_pose' is what the map keeps; F against its matrix."""
+    poses = ring_way(25)
+    seen, kept = [], []
+    for seed in range(120):
+        line_map = seen_often(RING[:4], poses, "odometry", seed)
+        j = int(np.argmin(np.abs(line_map.rho - 9.0)))
+        assert abs(line_map.rho[j] - 9.0) < 0.3
+        # the wall x = 9, and the map's pose: the true one is known
+        error = poses[-1] - line_map._pose
+        seen.append(np.outer([wrap(-line_map.alpha[j]), 9.0 - line_map.rho[j]], error))
+        kept.append(line_map.tables[1].shared[j].copy())
+    mean, deviation = np.mean(seen, 0), np.std(seen, 0) / math.sqrt(len(seen))
+    assert (np.abs(mean - np.mean(kept, 0)) < 3.5 * deviation + 1e-9).all()
+    table = line_map.tables[1]
+    before = table.shared[table.alive].copy()
+    carry(table, 0.3, -0.7)
+    move = np.array([[1.0, 0.0, 0.7], [0.0, 1.0, 0.3], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(table.shared[table.alive], before @ move.T, atol=1e-15)
+
+
+def test_walls_that_are_not_quite_one_widen_their_line():
+    """A hundred scans of one of four pieces each, 1.5 mm to and fro: one line, which without them is known to 0.1 mm."""
+    values, without = [], []
+    for seed in range(20):
+        rng, line_map = np.random.default_rng(seed), LineMap(sensor=SENSOR)
+        offset = 2.0 + 1.5e-3 * rng.permutation([1.0, -1.0, 1.0, -1.0])
+        for k in rng.integers(0, 4, 100):
+            middle, sigma = 1.5 * k - 2.25, np.array([2.5e-3, 1e-3])  # 1.4 m long, an offset of 1 mm, 2.5 mrad
+            t = np.array([[1.0, 0.0], [-middle, 1.0]])
+            error = t @ (sigma * rng.standard_normal(2))
+            found = ScanLines(
+                np.array([offset[k] + error[1]]), error[:1], (t @ np.diag(sigma**2) @ t.T)[None],
+                np.array([[2.0, middle - 0.7, 2.0, middle + 0.7]]), np.zeros(1, int), np.zeros(0, int),
+                np.zeros((0, 4)), np.zeros(0),
+            )  # fmt: skip
+            line_map.insert(found, np.zeros(3), EXACT)
+        j = int(np.flatnonzero(line_map.line_alive)[0])
+        for k, true in enumerate(offset):
+            at = np.array([2.0, 1.5 * k - 2.25])
+            line = line_map.rho[j], line_map.alpha[j]
+            values.append(nees(*line, line_map.covariance[j], (true, 0.0), at))
+            without.append(nees(*line, line_map.tables[1].covariance[j], (true, 0.0), at))
+    assert 1.0 < np.mean(values) < 3.0
+    assert np.mean(without) > 20.0
+
+
+def test_unevenness_is_found_where_it_is():
+    """Deviations of 2 mm beside a noise of 1 mm, in offset and direction, and none: the floor."""
+    rng = np.random.default_rng(0)
+    for tau, least, most in ((2e-3, 1.7e-3, 2.3e-3), (0.0, 0.5 * STRAIGHT, 0.5 * STRAIGHT)):
+        sigma = np.array([1e-3 * math.sqrt(12) / 3.0, 1e-3])
+        of_walls = np.array([tau * math.sqrt(12) / 3.0, tau])
+        error = rng.normal(0.0, np.hypot(sigma, of_walls), (400, 2))
+        misfit = np.array([400.0, ((error / sigma) ** 2).sum(), 400.0 * 2.0 / 1e-6])
+        assert least <= math.sqrt(unevenness(misfit, 1e3, 0.5)) <= most
+
+
+def test_a_building_seen_again_and_again_takes_no_more_room():
+    poses, rng, sizes = ring_way(600), np.random.default_rng(0), []
+    line_map = LineMap(sensor=SENSOR)
+    for k, pose in enumerate(poses):
+        look(line_map, RING, pose, rng, POSE_SIGMA)
+        if k % 100 == 99:
+            arrays = sum(np.asarray(a).nbytes for table in line_map.tables for a in table)
+            sizes.append((arrays, line_map.line_alive.sum(), line_map.alive.sum(), line_map.alive.size))
+    arrays, lines, rows, slots = np.array(sizes).T
+    assert (arrays == arrays[0]).all()
+    assert lines[1:].max() <= lines[1] + 1
+    assert rows[1:].max() <= rows[1] + 2
+    assert slots[-1] <= slots[1] + 3
+
+
 def test_a_doorway_stays_open_and_separate_walls_share_a_line():
     walls = [[3, -2.5, 3, -0.45], [3, 0.45, 3, 2.5], [6, -4, 6, 4], *box(-3, -2.5, 3, 2.5)[2:]]
     rng = np.random.default_rng(0)
@@ -450,7 +592,7 @@ def test_index_and_brute_force_find_the_same_partners():
             line = to_map(lines.rho[i], lines.alpha[i], lines.covariance[i], pose, EXACT)
             n, _ = candidates(
                 *line, placed, lines.segment_line, i, line_map._rows, line_map._lines, line_map._grid,
-                line_map.config.merge_gate, line_map.config.door_width, 10**9, -1, found, out,
+                line_map.config.merge_gate, line_map.config.door_width, 10**9, -1, np.zeros((2, 3)), False, found, out,
             )  # fmt: skip
             expected = brute_force(line_map, *line, placed[lines.segment_line == i])
             # the index may offer a few lines more, whose rows lie just outside the box

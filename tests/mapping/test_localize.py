@@ -195,6 +195,11 @@ def test_joint_covariance_stays_one():
         assert np.linalg.eigvalsh(joint * np.outer(scale, scale)).min() > -1e-6
         assert np.linalg.eigvalsh(fix.relative).min() >= -1e-15
         assert np.trace(fix.relative) <= np.trace(p) + 1e-12
+        absolute = localizer.covariance(line_map) - line_map.tables[1].spread[: line_map.rho.size]
+        for j in alive:
+            sign = np.array([1.0, line_map.line_side[j]])
+            own = localizer._lines[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
+            np.testing.assert_allclose(absolute[j], own * np.outer(sign, sign), rtol=1e-9, atol=1e-18)
 
 
 def test_parallel_walls_20_cm_apart_are_told_apart_or_left_alone():
