@@ -43,7 +43,7 @@ class Masked(FilterObservation):
 
 
 def make_env() -> gym.Env:
-    return Masked(gym.make("polyexplore_gym:PolyExplore-Home-v1", config=CONFIG), KEYS)
+    return Masked(gym.make("polyexplore_gym:PolyExplore-Home-v2", config=CONFIG), KEYS)
 
 
 # 2. The learner.

@@ -5,7 +5,7 @@ from gymnasium.envs.registration import register
 __version__ = "0.1.0"
 
 _ENTRY = "polyexplore_gym.env:PolyExploreEnv"
-register("PolyExplore-Home-v1", _ENTRY, kwargs={"suite": "home-train"})
-register("PolyExplore-Office-v1", _ENTRY, kwargs={"suite": "office-train"})
-register("PolyExplore-Mixed-v1", _ENTRY, kwargs={"suite": "mixed-train"})
-register("PolyExplore-Plan-v1", _ENTRY)
+register("PolyExplore-Home-v2", _ENTRY, kwargs={"suite": "home-train"})
+register("PolyExplore-Office-v2", _ENTRY, kwargs={"suite": "office-train"})
+register("PolyExplore-Mixed-v2", _ENTRY, kwargs={"suite": "mixed-train"})
+register("PolyExplore-Plan-v2", _ENTRY)

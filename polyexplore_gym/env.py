@@ -75,7 +75,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             InvalidFloorPlanError: the plan cannot be read or is invalid.
         """
         if plan is not None and suite is not None:
-            raise InvalidConfigError(f"a plan and the suite {suite!r}: give one (PolyExplore-Plan-v1 takes a plan)")
+            raise InvalidConfigError(f"a plan and the suite {suite!r}: give one (PolyExplore-Plan-v2 takes a plan)")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidConfigError(f"render_mode {render_mode!r}: must be None, 'rgb_array' or 'human'")
         self.config = (

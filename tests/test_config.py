@@ -165,7 +165,7 @@ def test_presets_by_name_in_a_mapping_and_through_make():
     whole = from_mapping(EnvConfig, {"preset": "turtlebot3", "sensor": SensorConfig()})
     assert (whole.sensor, whole.robot) == (SensorConfig(), burger.robot)
     for config in (burger, {"preset": "turtlebot3"}):
-        env = gym.make("polyexplore_gym:PolyExplore-Home-v1", config=config)
+        env = gym.make("polyexplore_gym:PolyExplore-Home-v2", config=config)
         assert env.unwrapped.config == burger
         assert gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json())).unwrapped.config == burger
     for name in ("r2d2", 3, None):

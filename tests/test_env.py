@@ -52,7 +52,7 @@ def house_path(tmp_path_factory) -> str:
 
 
 def arguments(name: str, path: str) -> dict[str, Any]:
-    return {"plan": path} if name == "PolyExplore-Plan-v1" else {}
+    return {"plan": path} if name == "PolyExplore-Plan-v2" else {}
 
 
 def check_observation(env: PolyExploreEnv, observation: dict[str, np.ndarray], info: dict[str, Any]) -> None:
@@ -130,7 +130,7 @@ def check_outcome(outcome: dict[str, Any], terminated: bool, truncated: bool) ->
 
 
 def test_the_registry():
-    assert {"PolyExplore-Home-v1", "PolyExplore-Office-v1", "PolyExplore-Mixed-v1", "PolyExplore-Plan-v1"} <= set(
+    assert {"PolyExplore-Home-v2", "PolyExplore-Office-v2", "PolyExplore-Mixed-v2", "PolyExplore-Plan-v2"} <= set(
         REGISTERED
     )
 
@@ -142,7 +142,7 @@ def test_gymnasium_checker(name, house_path, monkeypatch):
     env = gym.make(name, config=SMALL, **arguments(name, house_path))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=name != "PolyExplore-Plan-v1")
+        check_env(env.unwrapped, skip_render_check=name != "PolyExplore-Plan-v2")
     env.close()
 
 
@@ -169,9 +169,9 @@ def masked(mask: np.ndarray) -> list[int]:
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_gymnasium_vector_environments(mode, house_path):
     kwargs = {"config": SMALL, "plan": house_path}
-    envs = gym.make_vec("PolyExplore-Plan-v1", num_envs=2, vectorization_mode=mode, **kwargs)
+    envs = gym.make_vec("PolyExplore-Plan-v2", num_envs=2, vectorization_mode=mode, **kwargs)
     observation, info = envs.reset(seed=[3, 4])
-    single = gym.make("PolyExplore-Plan-v1", **kwargs)
+    single = gym.make("PolyExplore-Plan-v2", **kwargs)
     alone, alone_info = single.reset(seed=4)
     lengths = set()
     for _ in range(12):
@@ -196,7 +196,7 @@ def test_stable_baselines_vector_environments(kind, house_path):
     vec = pytest.importorskip("stable_baselines3.common.vec_env")
 
     def make(rank: int):
-        return lambda: gym.make("polyexplore_gym:PolyExplore-Plan-v1", plan=house_path, config=SMALL)
+        return lambda: gym.make("polyexplore_gym:PolyExplore-Plan-v2", plan=house_path, config=SMALL)
 
     envs = getattr(vec, kind)([make(i) for i in range(2)])
     envs.seed(5)
@@ -231,7 +231,7 @@ def test_maskable_ppo_learns_through_make():
             return True
 
     watch = Watch()
-    env = gym.make("PolyExplore-Home-v1", config=SMALL)
+    env = gym.make("PolyExplore-Home-v2", config=SMALL)
     model = contrib.MaskablePPO("MultiInputPolicy", env, n_steps=64, batch_size=32, n_epochs=2, seed=0)
     start = [p.detach().clone() for p in model.policy.parameters()]
     model.learn(256, callback=watch)
@@ -248,7 +248,7 @@ def test_maskable_ppo_learns_through_make():
 def test_make_in_a_fresh_process(house_path):
     code = (
         "import sys, gymnasium as gym\n"
-        "env = gym.make('polyexplore_gym:PolyExplore-Plan-v1', plan=sys.argv[1])\n"
+        "env = gym.make('polyexplore_gym:PolyExplore-Plan-v2', plan=sys.argv[1])\n"
         "observation, info = env.reset(seed=3)\n"
         "*_, info = env.step(int(info['action_mask'].argmax()))\n"
         "print(env.unwrapped.plan.name, repr(info['distance']))\n"
@@ -262,7 +262,7 @@ def test_make_in_a_fresh_process(house_path):
 
 @pytest.mark.parametrize("dumps", [pickle.dumps, cloudpickle.dumps])
 def test_pickling_a_made_environment(dumps, house_path):
-    env = gym.make("PolyExplore-Plan-v1", plan=house_path, config=SMALL)
+    env = gym.make("PolyExplore-Plan-v2", plan=house_path, config=SMALL)
     copies = [pickle.loads(dumps(env))]
     env.reset(seed=0)
     copies[0].reset(seed=0)
@@ -280,7 +280,7 @@ def test_pickling_a_made_environment(dumps, house_path):
 
 def test_spec_goes_to_json_and_back(house_path):
     config = EnvConfig(**{**to_parts(SMALL), "max_decisions": 7})
-    env = gym.make("PolyExplore-Plan-v1", plan=house_path, config=config)
+    env = gym.make("PolyExplore-Plan-v2", plan=house_path, config=config)
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.config == env.unwrapped.config == config
     first, _ = env.reset(seed=1)
@@ -336,7 +336,7 @@ def test_config_as_object_mapping_or_none():
 )
 def test_bad_configurations(config, message):
     with pytest.raises(InvalidConfigError, match=message):
-        gym.make("PolyExplore-Plan-v1", config=config)
+        gym.make("PolyExplore-Plan-v2", config=config)
 
 
 @pytest.mark.parametrize(
@@ -523,7 +523,7 @@ def test_steps_before_reset_and_after_the_end():
         with pytest.raises(gym.error.ResetNeeded):
             call()
     with pytest.raises(gym.error.ResetNeeded):
-        gym.make("PolyExplore-Plan-v1", plan=HOUSE).step(0)
+        gym.make("PolyExplore-Plan-v2", plan=HOUSE).step(0)
     *_, (_, observation, _, info, _) = play(env, seed=2)
     pose = env.true_pose
     for _ in range(2):
@@ -818,7 +818,7 @@ def test_path_lengths_between_nodes():
 
 
 def test_rgb_array(house_path):
-    env = gym.make("PolyExplore-Plan-v1", plan=house_path, config=KINEMATIC, render_mode="rgb_array")
+    env = gym.make("PolyExplore-Plan-v2", plan=house_path, config=KINEMATIC, render_mode="rgb_array")
     _, info = env.reset(seed=0)
     first = env.render()
     env.step(int(info["action_mask"].argmax()))

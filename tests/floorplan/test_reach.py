@@ -124,7 +124,7 @@ def test_the_trimmed_floor_is_what_the_disc_sweeps_and_its_corners(seed, radius)
 
 def test_the_environment_gives_radius_and_start_to_the_loader(tmp_path):
     save_plan(FloorPlan.create(ROOMS), tmp_path / "plan.json")
-    name = "polyexplore_gym:PolyExplore-Plan-v1"
+    name = "polyexplore_gym:PolyExplore-Plan-v2"
 
     def make(plan, radius):
         return gym.make(name, plan=plan, config={"robot": {"radius": radius}, "drive": {"mode": "kinematic"}})
