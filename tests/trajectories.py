@@ -30,10 +30,11 @@ FAMILIES = ("home", "office", "angled")
 CONFIGS = {
     "kinematic": EnvConfig(drive=DriveConfig(mode="kinematic")),
     "physics": EnvConfig(pose=PoseConfig(mode="gaussian"), exploration=ExplorationConfig(placement="in_front")),
+    "moving": EnvConfig(exploration=ExplorationConfig(scan_every=0.5, decide="settled")),
 }
-# 12 plans x 5 seeds; both ways of driving on every plan.
+# 12 plans x 5 seeds; all configurations on every plan.
 TASKS = [
-    (family, plan, seed, ("kinematic", "physics")[(plan + seed) % 2])
+    (family, plan, seed, tuple(CONFIGS)[(plan + seed) % 3])
     for family in FAMILIES
     for plan in range(4)
     for seed in range(5)

@@ -31,12 +31,14 @@ ENVIRONMENT = "v0"
 SHIPPED = Path(__file__).parent / "models" / "selector.safetensors"
 """The model that comes with the package."""
 _LARGEST = 256 * 2**20
+_UNREAD = frozenset({"node_pursued"})
+"""Keys of the observation that the features do not look at: models know nothing of them."""
 
 
 def space_hash() -> str:
     """What a model's input depends on: the observation's keys, shapes per node and types, and the features."""
     spaces = observation.space(ObservationConfig(max_nodes=1, max_lines=1)).spaces
-    keys = [(key, list(box.shape or ()), str(box.dtype)) for key, box in sorted(spaces.items())]
+    keys = [(key, list(box.shape or ()), str(box.dtype)) for key, box in sorted(spaces.items()) if key not in _UNREAD]
     sizes = [features.SCALARS, features.VECTORS, features.RAYS, features.REACH, features.PAIR, features.WHOLE]
     return hashlib.sha256(json.dumps([keys, sizes]).encode()).hexdigest()
 

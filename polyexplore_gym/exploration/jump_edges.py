@@ -61,7 +61,8 @@ class Opened(NamedTuple):
     width: np.ndarray
     """(c,) with the gaps between its pieces and on to the walls at its ends, m"""
     room: np.ndarray
-    """(c,) twice the distance from walls of that place on it (of those tried) that has most, m; `tol.gap` at most"""
+    """(c,) twice the distance from walls of that place on it (of those tried) that has most, m; `tol.gap` at most, and
+    0 where it is too narrow anyhow"""
     middle: np.ndarray
     """(c, 2) point at half the length"""
     normal: np.ndarray
@@ -610,6 +611,11 @@ def _room(segments, rows, walls, tol):
     """How wide a disc that goes through a chain (rows in order) may be: see `Opened.room`."""
     best = 0.0
     step = 0.1 * tol.gap
+    for i in rows:  # most have room in the middle of a piece
+        mx = 0.5 * (segments[i, 0] + segments[i, 2])
+        my = 0.5 * (segments[i, 1] + segments[i, 3])
+        if 2.0 * _free(mx, my, walls, 0.5 * tol.gap) >= tol.gap:
+            return tol.gap
     x = segments[rows[0], 0]
     y = segments[rows[0], 1]
     for i in rows:
@@ -668,7 +674,8 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
             out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
             out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
         out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
-        out.room[q] = _room(segments, order[offsets[q] : offsets[q + 1]], walls, tol)
+        if out.width[q] >= tol.gap - 3.0 * tol.sigma_range:  # else too narrow anyhow
+            out.room[q] = _room(segments, order[offsets[q] : offsets[q + 1]], walls, tol)
         run = 0.0
         out.middle[q, 0] = out.ends[q, 0]
         out.middle[q, 1] = out.ends[q, 1]
