@@ -242,13 +242,9 @@ def shape(mapped: Mapped, plan: FloorPlan) -> tuple[int, int, int, float, float,
     ends = rows.reshape(-1, 2)
     corners = walls[:, :2]
     off = np.min(np.hypot(*(ends[:, None] - corners[None]).transpose(2, 0, 1)), axis=1)
-    return (
-        int(line_map.line_alive.sum()),
-        len(rows),
-        covered(walls, rows),
-        covered(rows, walls),
-        float((off < 0.1).mean()),
-    )
+    lines = np.flatnonzero(line_map.line_alive).tolist()
+    none = sum(mapped.wall[j][1] < 0 for j in lines)
+    return len(lines), none, len(rows), covered(walls, rows), covered(rows, walls), float((off < 0.1).mean())
 
 
 def table(rows: np.ndarray) -> list[list[str]]:

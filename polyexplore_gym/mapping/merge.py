@@ -45,10 +45,7 @@ COVER = 0.08  # what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.2  # pieces of one line are joined across this + 3 sigma, at most half a door
 LEAST_PIECE = 0.02  # shorter pieces on a line are widened to this
 LEAST_END = 0.01  # smallest standard deviation kept for a segment's end along its line
-DISAGREEMENT = 2.0  # sum of chi-squares so many standard deviations too large: what was fused is not one straight wall
-STRAIGHT = (
-    6e-4  # walls that count as one stay so near to their line (0.3 mm at 0.5 m: whole millimetres, as in drawings)
-)
+STRAIGHT = 6e-4  # the walls of one line stay so near to it: 0.3 mm at 0.5 m, as drawings in whole millimetres do
 CLOSE_LOOK = 0.1  # how densely it is looked at what of a segment is known
 
 
@@ -366,7 +363,7 @@ def unevenness(misfit: np.ndarray, gate: float, door: float) -> float:
     q = math.exp(-0.5 * gate)
     excess = misfit[1] - misfit[0] * (2.0 - gate * q / (1.0 - q))
     least = (STRAIGHT * door) ** 2
-    return max(excess / misfit[2], least) if excess > DISAGREEMENT * 2.0 * math.sqrt(misfit[0]) else least
+    return max(excess / misfit[2], least) if misfit[2] > 0.0 else least
 
 
 @njit(cache=True)
@@ -504,6 +501,8 @@ def insert(
         seen_by = by_pose(a0, pose)
         c0 = product(seen_by, pose_covariance) if drifting else np.zeros((2, 3))
         low, high = extent(placed[:, :4], of, i, a0)
+        middle = 0.5 * (low + high)
+        own_x, own_y = r0 * math.cos(a0) - middle * math.sin(a0), r0 * math.sin(a0) + middle * math.cos(a0)
         misfit = np.zeros(3)
         target, count = -1, 0
         if best[i] >= 0:
@@ -529,7 +528,7 @@ def insert(
             misfit += lines.misfit[j]
             misfit[0] += 1.0
             misfit[1] += d2
-            misfit[2] += sensitivity(difference(a0, p0, alpha_j, p_j, common, x, y), high - low)
+            misfit[2] += sensitivity(difference(a0, p0, alpha_j, p_j, common, own_x, own_y), high - low)
             r0, a0, p0, old, new = fuse(r0, a0, p0, rho_j, alpha_j, p_j, common, x, y)
             c0 = product(old, c0) + product(new, c_j)
             if j != target:
