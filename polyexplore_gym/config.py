@@ -170,6 +170,9 @@ class MappingConfig:
     decide in the map (what covers, joins, is too short) are shares of it."""
     range_floor: float = 0.0
     """Smallest standard deviation of range assumed in the fit, m (real logs: 0.005 to 0.01)."""
+    straightness: float = 0.0
+    """Smallest standard deviation of a wall about its line that the map reports, m; what scans show to be more uneven
+    is found by itself. A drawing in whole millimetres, seen in hundreds of scans, wants 0.0003."""
 
     def __post_init__(self) -> None:
         _check_types(self)
@@ -180,6 +183,7 @@ class MappingConfig:
             value = getattr(self, name)
             _require(value is None or value > 0, self, name, "must be positive or None")
         _require(self.range_floor >= 0, self, "range_floor", "must not be negative")
+        _require(self.straightness >= 0, self, "straightness", "must not be negative")
 
     def resolved(self, radius: float = 0.25) -> MappingConfig:
         """The same with numbers for all that is None, for a robot of `radius` m."""

@@ -14,7 +14,7 @@ from numba import njit
 
 from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, subtract
 from polyexplore_gym.exploration.segments import crossing, point_segment_distance
-from polyexplore_gym.exploration.tolerances import noise_at
+from polyexplore_gym.exploration.tolerances import end_noise, noise_at
 
 _PARALLEL = 0.5
 """Sine of the largest angle between a wall and an open edge that it covers."""
@@ -592,9 +592,10 @@ def _to_wall(x, y, walls, tol):
 
 
 @njit(cache=True)
-def _free(x, y, walls, most):
-    """Distance of a point from the nearest wall, `most` at most."""
+def _free(x, y, walls, most, tol):
+    """Distance of a point from the nearest wall, `most` at most; noise may have made walls longer at their ends."""
     best = most
+    less = end_noise(tol)
     for w in range(walls.shape[0]):
         if (
             min(walls[w, 0], walls[w, 2]) < x + best
@@ -602,7 +603,16 @@ def _free(x, y, walls, most):
             and min(walls[w, 1], walls[w, 3]) < y + best
             and max(walls[w, 1], walls[w, 3]) > y - best
         ):
-            best = min(best, point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]))
+            dx = walls[w, 2] - walls[w, 0]
+            dy = walls[w, 3] - walls[w, 1]
+            length = math.hypot(dx, dy)
+            f = less / length if length > 3.0 * less else 0.0
+            best = min(
+                best,
+                point_segment_distance(
+                    x, y, walls[w, 0] + f * dx, walls[w, 1] + f * dy, walls[w, 2] - f * dx, walls[w, 3] - f * dy
+                ),
+            )
     return best
 
 
@@ -614,7 +624,7 @@ def _room(segments, rows, walls, tol):
     for i in rows:  # most have room in the middle of a piece
         mx = 0.5 * (segments[i, 0] + segments[i, 2])
         my = 0.5 * (segments[i, 1] + segments[i, 3])
-        if 2.0 * _free(mx, my, walls, 0.5 * tol.gap) >= tol.gap:
+        if 2.0 * _free(mx, my, walls, 0.5 * tol.gap, tol) >= tol.gap:
             return tol.gap
     x = segments[rows[0], 0]
     y = segments[rows[0], 1]
@@ -625,7 +635,7 @@ def _room(segments, rows, walls, tol):
             parts = max(int(math.hypot(ex - x, ey - y) / step), 1)
             for k in range(parts + 1):
                 f = k / parts
-                best = max(best, 2.0 * _free(x + f * (ex - x), y + f * (ey - y), walls, 0.5 * tol.gap))
+                best = max(best, 2.0 * _free(x + f * (ex - x), y + f * (ey - y), walls, 0.5 * tol.gap, tol))
                 if best >= tol.gap:
                     return best
             x = ex

@@ -18,7 +18,7 @@ from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph
 from polyexplore_gym.exploration.scan_polygon import Scans
 from polyexplore_gym.exploration.segments import segment_distance
-from polyexplore_gym.exploration.tolerances import squeezed, tolerances
+from polyexplore_gym.exploration.tolerances import end_noise, squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
 VISIT = 2
@@ -470,10 +470,10 @@ class ExplorationMap:
         return bool(self.reachable.any())
 
     def _shortened(self, walls: np.ndarray) -> np.ndarray:
-        """Walls (m, 4) less what noise may have added at their ends: where a wall is seen at a slant, several sigma."""
+        """Walls (m, 4) less what noise may have added at their ends."""
         way = walls[:, 2:] - walls[:, :2]
         length = np.hypot(*way.T)
-        less = min(6.0 * self.tol.sigma_range, 0.25 * self.tol.radius)
+        less = end_noise(self.tol)
         share = np.where(length > 3.0 * less, less / np.maximum(length, 1e-300), 0.0)[:, None]
         return np.concatenate((walls[:, :2] + share * way, walls[:, 2:] - share * way), axis=1)
 

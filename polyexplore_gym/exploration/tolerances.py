@@ -170,3 +170,9 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
 def noise_at(distance, tol):
     """Standard deviation (m) of the end point of a beam at a distance (m): range, and angle across the beam."""
     return math.sqrt(tol.sigma_range * tol.sigma_range + (tol.sigma_angle * distance) ** 2)
+
+
+@njit(cache=True, inline="always")
+def end_noise(tol):
+    """How much longer (m) than it is a wall may seem at either end: seen at a slant, several sigma."""
+    return min(6.0 * tol.sigma_range, 0.25 * tol.radius)

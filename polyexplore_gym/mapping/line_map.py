@@ -89,7 +89,7 @@ class LineMap:
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
-            self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
+            self.config.straightness, self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
             self._rows, self._lines, self._grid, slots,
         )  # fmt: skip
         self._pose = pose.copy()

@@ -45,7 +45,6 @@ COVER = 0.08  # what lies within this + 3 sigma of a known segment is known
 BRIDGE = 0.2  # pieces of one line are joined across this + 3 sigma, at most half a door
 LEAST_PIECE = 0.02  # shorter pieces on a line are widened to this
 LEAST_END = 0.01  # smallest standard deviation kept for a segment's end along its line
-STRAIGHT = 6e-4  # the walls of one line stay so near to it: 0.3 mm at 0.5 m, as drawings in whole millimetres do
 CLOSE_LOOK = 0.1  # how densely it is looked at what of a segment is known
 
 
@@ -352,8 +351,9 @@ def sensitivity(s: np.ndarray, length: float) -> float:
 
 
 @njit(cache=True)
-def unevenness(misfit: np.ndarray, gate: float, door: float) -> float:
-    """Variance of walls about the line that they were fused to, m2: `STRAIGHT`, unless the scans disagree by more.
+def unevenness(misfit: np.ndarray, gate: float, least: float) -> float:
+    """Variance of walls about the line that they were fused to, m2: that of `least` m, unless the scans disagree by
+    more.
 
     A random-effects model: what a scan shows of a line of length l is off it by tau across and by tau sqrt(12) / l in
     direction, anew for every wall or place, beside the noise. Estimated by moments from the chi-squares Q of the n
@@ -362,8 +362,7 @@ def unevenness(misfit: np.ndarray, gate: float, door: float) -> float:
     """
     q = math.exp(-0.5 * gate)
     excess = misfit[1] - misfit[0] * (2.0 - gate * q / (1.0 - q))
-    least = (STRAIGHT * door) ** 2
-    return max(excess / misfit[2], least) if misfit[2] > 0.0 else least
+    return max(excess / misfit[2], least * least) if misfit[2] > 0.0 else least * least
 
 
 @njit(cache=True)
@@ -421,6 +420,7 @@ def insert(
     var_angle: float,
     gate: float,
     door: float,
+    straightness: float,
     grouping: bool,
     drifting: bool,
     moved: np.ndarray,
@@ -571,7 +571,7 @@ def insert(
         store(lines, target, r0, a0, p0, c0)
         lay(target, fresh, m, rows, lines, grid, slots, door)
         lines.misfit[target] = misfit
-        spread_out(target, unevenness(misfit, gate, door), rows, lines)
+        spread_out(target, unevenness(misfit, gate, straightness), rows, lines)
         clear_covered(target, rows, lines, grid, slots, sigma_range, door, found)
 
     piece = np.empty(4)

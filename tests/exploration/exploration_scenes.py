@@ -217,6 +217,11 @@ def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
 def room_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
     """How wide a disc that goes through a chain of open edges (m, 4), gaps included, may be: `tol.gap` at most."""
     along = shapely.LineString(chain.reshape(-1, 2)).segmentize(0.01 * tol.gap)
+    less = min(6.0 * tol.sigma_range, 0.25 * tol.radius)  # noise may have made walls longer
+    way = walls[:, 2:] - walls[:, :2]
+    length = np.hypot(*way.T)
+    share = np.where(length > 3.0 * less, less / length, 0.0)[:, None]
+    walls = np.concatenate((walls[:, :2] + share * way, walls[:, 2:] - share * way), axis=1)
     away = shapely.distance(lines_of(walls), shapely.points(shapely.get_coordinates(along))) if len(walls) else math.inf
     return float(min(2.0 * np.max(away), tol.gap))
 

@@ -12,7 +12,7 @@ from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.mapping import LineMap, ScanLines, extract_lines
 from polyexplore_gym.mapping.fit import to_map, wrap
 from polyexplore_gym.mapping.grid import empty_grid, grid_put, grid_query, grid_remove
-from polyexplore_gym.mapping.merge import STRAIGHT, candidates, unevenness
+from polyexplore_gym.mapping.merge import candidates, unevenness
 from polyexplore_gym.mapping.slots import carry, oriented
 
 pytestmark = pytest.mark.bounds
@@ -414,12 +414,12 @@ def test_walls_that_are_not_quite_one_widen_their_line():
 def test_unevenness_is_found_where_it_is():
     """Deviations of 2 mm beside a noise of 1 mm, in offset and direction, and none: the floor."""
     rng = np.random.default_rng(0)
-    for tau, least, most in ((2e-3, 1.7e-3, 2.3e-3), (0.0, 0.5 * STRAIGHT, 0.5 * STRAIGHT)):
+    for tau, least, most in ((2e-3, 1.7e-3, 2.3e-3), (0.0, 3e-4, 3e-4)):
         sigma = np.array([1e-3 * math.sqrt(12) / 3.0, 1e-3])
         of_walls = np.array([tau * math.sqrt(12) / 3.0, tau])
         error = rng.normal(0.0, np.hypot(sigma, of_walls), (400, 2))
         misfit = np.array([400.0, ((error / sigma) ** 2).sum(), 400.0 * 2.0 / 1e-6])
-        assert least <= math.sqrt(unevenness(misfit, 1e3, 0.5)) <= most
+        assert least <= math.sqrt(unevenness(misfit, 1e3, 3e-4)) <= most
 
 
 def test_a_building_seen_again_and_again_takes_no_more_room():
