@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from polyexplore_gym import observation
-from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.config import EnvConfig, RobotConfig, from_mapping
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidFloorPlanError
 from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
@@ -127,7 +128,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             plan.check_start(start, c.robot.radius)
             pose = np.array([*start, 0.0][:3], dtype=np.float64)
         self.plan = plan
-        self._world = World(plan.segments, c.robot, c.sensor, c.drive, pose)
+        self._world = World(plan.segments, _careful(c), c.sensor, c.drive, pose)
         self._pose_model = PoseModel(c.pose, pose, pose_rng)
         self._coverage = Coverage(grid_points(plan.segments, grid_spacing(c.robot.radius, plan.area)))
         self._mapping = c.mapping.resolved(c.robot.radius)
@@ -489,6 +490,15 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             measurements=self._measurements,
             title=self.plan.name,
         )
+
+
+def _careful(config: EnvConfig) -> RobotConfig:
+    """The robot; if it decides on the way, no faster than lets it halt within the way between two scans."""
+    robot, exploration = config.robot, config.exploration
+    if exploration.decide == "arrival":
+        return robot
+    speed = math.sqrt(2.0 * robot.max_acceleration * exploration.scan_every)
+    return dataclasses.replace(robot, max_speed=min(robot.max_speed, speed))
 
 
 def _suite(name: str) -> Suite:
