@@ -365,12 +365,14 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         np.zeros(n, np.bool_), np.full(n, -1, np.int64),
     )  # fmt: skip
     stale = np.ones(n, np.bool_)
-    lost = np.zeros(next_id + 1, np.bool_)
-    size_before = np.zeros(next_id + 1)
+    ids = np.unique(pieces.owner)
+    row = np.searchsorted(ids, pieces.owner)
+    lost = np.zeros(ids.size, np.bool_)
+    size_before = np.zeros(ids.size)
     for i in range(m):
-        if dirty[i] and pieces.owner[i] >= 0:
-            lost[pieces.owner[i]] = True
-        size_before[pieces.owner[i]] += _size(pieces.segments[i])  # the last stands for pieces without a chain
+        if dirty[i]:
+            lost[row[i]] = True
+        size_before[row[i]] += _size(pieces.segments[i])
     at = 0
     k = 0
     for i in range(m):  # in the old order: the pieces of a chain stay in theirs
@@ -393,7 +395,7 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         at += 1
     owner_before = p.owner.copy()
     for i in range(n):
-        if p.owner[i] >= 0 and lost[p.owner[i]]:
+        if p.owner[i] >= 0 and lost[np.searchsorted(ids, p.owner[i])]:
             stale[i] = True
         if p.settled[i] or p.visits[i] >= max_visits:
             p.owner[i] = -1
@@ -410,7 +412,7 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     left_of = np.full(new.id.size, -1, np.int64)
     for q in range(new.id.size):
         members = rows[order[offsets[q] : offsets[q + 1]]]
-        left_of[q] = _most_of(p.segments, owner_before, members, size_before)
+        left_of[q] = _most_of(p.segments, owner_before, members, ids, size_before)
         for i in members:
             p.owner[i] = new.id[q]
             keep[i] = new.width[q] >= tol.trifle
@@ -432,8 +434,8 @@ def _size(segment):
 
 
 @njit(cache=True)
-def _most_of(segments, owner, members, size_before):
-    """The owner that most of the members (k,) had, if they are also most of what it had (o,); else -1."""
+def _most_of(segments, owner, members, ids, size_before):
+    """The owner that most of the members (k,) had, if they are also most of what that of `ids` (o,) had; else -1."""
     total = 0.0
     for i in members:
         total += _size(segments[i])
@@ -445,7 +447,7 @@ def _most_of(segments, owner, members, size_before):
             if owner[j] == owner[i]:
                 share += _size(segments[j])
         if 2.0 * share > total:
-            return owner[i] if 2.0 * share > size_before[owner[i]] else -1
+            return owner[i] if 2.0 * share > size_before[np.searchsorted(ids, owner[i])] else -1
     return -1
 
 

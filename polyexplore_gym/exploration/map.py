@@ -338,11 +338,9 @@ class ExplorationMap:
         )
         self.pieces, new = Pieces(*done), Opened(*opened)
         owner = self.pieces.owner
-        alive = np.zeros(self._next_id + len(new.id) + 1, np.bool_)
         self._next_id += len(new.id)
-        alive[owner] = True  # the last one stands for pieces without a chain
         c = self.chains
-        staying = alive[c.id]
+        staying = np.isin(c.id, owner)
         wide = np.flatnonzero(np.minimum(new.width, new.room) >= self.least_width)
         gone = np.flatnonzero(~staying)
         again = jump_edges.unchanged(new, wide, gone, c.middle, c.ends)
