@@ -15,7 +15,7 @@ from numba import njit
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
 from polyexplore_gym.exploration.jump_edges import Opened, Pieces
-from polyexplore_gym.exploration.path_graph import PathGraph
+from polyexplore_gym.exploration.path_graph import PathGraph, way_back
 from polyexplore_gym.exploration.scan_polygon import Scans
 from polyexplore_gym.exploration.segments import segment_distance
 from polyexplore_gym.exploration.tolerances import end_noise, squeezed, tolerances
@@ -536,23 +536,14 @@ class ExplorationMap:
         rx, ry, found = self.graph.retreat(x, y)
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
-        points, driven = [(x, y)], [0.0]
-        grain = 1.0 / self.tol.same_point
-        been = {(round(x * grain), round(y * grain)): 0}
-        back = itertools.chain.from_iterable(way[::-1].tolist() for way in reversed(self._trail))
-        for px, py in itertools.islice(back, _LONGEST_WAY):
-            spot = round(px * grain), round(py * grain)
-            if spot in been:  # a loop: it led back here
-                first = been[spot]
-                been = {s: k for s, k in been.items() if k <= first} if first < len(points) - 1 else been
-                del points[first + 1 :], driven[first + 1 :]
-                continue
-            been[spot] = len(points)
-            driven.append(driven[-1] + math.dist((px, py), points[-1]))
-            points.append((px, py))
-            if self.graph.clearance(px, py) >= self.tol.need or driven[-1] > self.tol.back:
+        last, length = [], 0
+        for way in reversed(self._trail):
+            last.append(way[::-1])
+            length += len(way)
+            if length >= _LONGEST_WAY:
                 break
-        return points
+        back = np.concatenate([np.array([[x, y]]), *last])[: _LONGEST_WAY + 1]
+        return [(px, py) for px, py in way_back(back, self.graph.walls, self.tol).tolist()]
 
     def _update_paths(self) -> None:
         g, c = self.graph, self.chains

@@ -40,6 +40,7 @@ from polyexplore_gym.exploration.links import (
 )
 from polyexplore_gym.exploration.scan_polygon import EVERYTHING, Scans
 from polyexplore_gym.exploration.segments import (
+    bucket,
     bucket_at,
     clearance,
     clearances,
@@ -93,6 +94,43 @@ def retreat(x, y, walls, tol):
         if best > tol.need:
             return bx, by, True
     return x, y, False
+
+
+@njit(cache=True)
+def way_back(way, walls, tol):
+    """The first part (p, 2) of the way `way` (k, 2) that leads to a place where paths begin, without its loops: where
+    it comes to a place once more, what lies between is left out."""
+    points = np.empty_like(way)
+    driven = np.zeros(way.shape[0])
+    keys = np.empty(way.shape, np.int64)
+    n_slots = 16
+    while n_slots < 2 * way.shape[0]:
+        n_slots *= 2
+    slots = np.full(n_slots, -1)  # the place in `points`, by a hash of its cell
+    n = 0
+    for x, y in way:
+        kx = round(x / tol.same_point)
+        ky = round(y / tol.same_point)
+        slot = bucket(kx, ky, n_slots - 1)
+        before = -1
+        while slots[slot] >= 0:
+            i = slots[slot]
+            if i < n and keys[i, 0] == kx and keys[i, 1] == ky:
+                before = i
+                break
+            slot = (slot + 1) & (n_slots - 1)
+        if before >= 0:
+            n = before + 1
+            continue
+        if n > 0:
+            driven[n] = driven[n - 1] + math.hypot(x - points[n - 1, 0], y - points[n - 1, 1])
+        points[n, 0], points[n, 1] = x, y
+        keys[n, 0], keys[n, 1] = kx, ky
+        slots[slot] = n
+        n += 1
+        if n > 1 and (clearance(x, y, walls, tol.reach) >= tol.need or driven[n - 1] > tol.back):
+            break
+    return points[:n].copy()
 
 
 @njit(cache=True)
