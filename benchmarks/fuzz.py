@@ -10,9 +10,10 @@ noise), both placements and drives, all pose modes, scans and decisions on the w
 criterion, and a plan in units of the robot: generated ones scaled so that their doors fit, and degenerate ones
 (`PLANS`). It is played in a child process, which is started anew after a crash, with a limit of CPU time.
 
-Findings: a crash (the process died), an exception, a hang (the CPU limit), a truncated episode, and an episode that
-ended although a place within reach would show more floor that no scan saw than `exact.py` allows. With the pose from
-odometry, `slam` or a localiser with an error the map is off, so only the other checks count. How an end is wrong:
+Findings: a crash (the process died), an exception, a hang (a decision that reaches the CPU limit), a truncated episode,
+and an episode that ended although a place within reach would show more floor that no scan saw than `exact.py` allows.
+With the pose from odometry, `slam` or a localiser with an error the map is off, so only the other checks count. How an
+end is wrong:
 
     jump edge masked    a jump edge borders what is left: the map knows of it but finds no place or path
     jump edge lost      none does: the map takes what is left for seen, or for wall
@@ -57,8 +58,8 @@ from polyexplore_gym.evaluation.tables import format_table
 from polyexplore_gym.exploration import shapes
 from polyexplore_gym.floorplan import FAMILIES, FloorPlan, generate
 
-CPU_LIMIT = 60.0
-"""CPU time of a case, s, and so much more for every 200 squares of the radius of its plan."""
+CPU_LIMIT, PATIENCE = 60.0, 180.0
+"""CPU time, s, of a decision (the first has a second more for every 200 squares of the radius) and of an episode."""
 DECISIONS = 2000
 """Decisions of a case, or one for every 20 squares of the radius: then it is truncated, a finding."""
 ON_THE_WAY = 5
@@ -362,25 +363,55 @@ def _against_a_wall(rng: np.random.Generator, plan: FloorPlan, radius: float) ->
 # One case ---------------------------------------------------------------------------------------
 
 
+class _SlowError(Exception):
+    """An episode goes on, but there is no more time for it."""
+
+
+class _Watched(PolyExploreEnv):
+    """Each decision has `CPU_LIMIT`, all of them together `PATIENCE`."""
+
+    def step(self, action: int) -> Any:
+        _allow(CPU_LIMIT)
+        result = super().step(action)
+        if _hard_limit is not None and time.process_time() - _began > PATIENCE:
+            raise _SlowError(f"{result[4]['measurements']} scans")
+        return result
+
+
+_hard_limit: int | None = None
+_began = 0.0
+
+
+def _allow(seconds: float) -> None:
+    """Let a child process go on for so much CPU time."""
+    if _hard_limit is not None:
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(time.process_time() + seconds), _hard_limit))
+
+
 def run(case: Case) -> tuple[PolyExploreEnv | None, exact.LeftOver | None, dict[str, Any]]:
     """Play a case; the environment, what is left (for an exact pose), and the result as plain values."""
     began = time.process_time()
     result = describe(case)
     try:
         config = from_mapping(EnvConfig, case.values)
-        env = PolyExploreEnv(plan=case.plan, config=config)
+        env = _Watched(plan=case.plan, config=config)
         options = None if case.start is None else {"start": tuple(case.start)}
         outcome, decisions, info = exact.play(env, load_policy(case.criterion), case.number, options)
     except (InvalidConfigError, InvalidFloorPlanError) as error:
         return None, None, {**result, "kind": "refused", "error": f"{type(error).__name__}: {error}"}
+    except _SlowError as slow:
+        return None, None, {**result, "kind": "slow", "error": str(slow)}
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         text = f"{type(error).__name__}: {error} ({Path(where.filename).name}:{where.lineno} {where.name})"
         return None, None, {**result, "kind": "exception", "error": text[:400]}
     result |= {"decisions": decisions, "scans": info["measurements"], "distance": round(info["distance"], 3),
                "seconds": round(time.process_time() - began, 2), "kind": outcome}  # fmt: skip
+    if outcome == "ended":
+        result["outcome"] = info["outcome"]["status"]
     if config.pose.mode != "exact":
         return env, None, result
+    _allow(CPU_LIMIT)
     found = exact.check(env)
     result |= {"seen": round(100.0 * found.share, 2), "left": round(found.area / found.limit, 3),
                "drivable": round(found.drivable / found.limit, 3), "open edges": len(env.exploration.chains.id),
@@ -521,15 +552,14 @@ def serve(scale: bool) -> None:
     faulthandler.enable()
     faulthandler.register(signal.SIGXCPU, chain=True)  # where it hangs, then the process ends
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    global _hard_limit, _began
     run(case_of(_FIRST))  # compiles the kernels
+    _hard_limit = resource.getrlimit(resource.RLIMIT_CPU)[1]
     for line in sys.stdin:
-        number = int(line)
-        used = resource.getrusage(resource.RUSAGE_SELF)
+        number, _began = int(line), time.process_time()
         try:
             case = case_of(number)
-            limit = used.ru_utime + used.ru_stime + CPU_LIMIT + case.size / 200.0
-            resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(limit), hard))
+            _allow(CPU_LIMIT + case.size / 200.0)
             result = run_scaled(number) if scale else run(case)[2]
         except Exception as error:  # of the fuzzer or of the check
             result = {"case": number, "kind": "fuzzer failed", "error": traceback.format_exc()[-600:] or str(error)}

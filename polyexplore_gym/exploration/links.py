@@ -397,14 +397,17 @@ def components(links, kind, n_vertices):
 
 @njit(cache=True)
 def anchors(points, vertices, n_vertices, walls, pieces, tol):
-    """A corner (k,) that the disc can go to straight from each of the points (k, 2), or -1."""
+    """A corner (k,) that the disc can go to straight from each of the points (k, 2) of a way, or -1."""
     position, kind = vertices.position, vertices.kind
     out = np.full(points.shape[0], -1, np.int64)
     for i in range(points.shape[0]):
         x = points[i, 0]
         y = points[i, 1]
-        for v in range(n_vertices):
-            if kind[v] != CORNER or abs(position[v, 0] - x) > tol.anchor or abs(position[v, 1] - y) > tol.anchor:
+        for k in range(n_vertices + 1):
+            v = k - 1 if k > 0 else out[max(0, i - 1)]  # first that of the point before
+            if v < 0 or kind[v] != CORNER:
+                continue
+            if abs(position[v, 0] - x) > tol.anchor or abs(position[v, 1] - y) > tol.anchor:
                 continue
             if sweep_free(x, y, position[v, 0], position[v, 1], walls, tol.sweep) and crossing_free(
                 x, y, position[v, 0], position[v, 1], pieces, -2, -2, 0.0, 0.0

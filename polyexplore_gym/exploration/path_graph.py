@@ -329,11 +329,15 @@ class PathGraph:
 
         Only the points that no corner can stand for are laid, and those between two parts of the graph.
         """
-        anchor = anchors(points, self.vertices, self.n_vertices, self.walls, self.pieces, self.tol)
+        anchor = self._laid_before(points)
+        new = anchor < 0
+        anchor[new] = anchors(points[new], self.vertices, self.n_vertices, self.walls, self.pieces, self.tol)
         part = np.where(anchor < 0, -1, components(self.links, self.vertices.kind, self.n_vertices)[anchor])
         changes = part[:-1] != part[1:]
         laid = np.flatnonzero((part < 0) | np.append(changes, True) | np.append(True, changes))
-        ids = self._trail_vertices(points[laid])
+        ids = self._laid_before(points[laid])
+        fresh = ids < 0
+        ids[fresh] = self._new_vertices(points[laid[fresh]], Shapes.free(points[laid[fresh]], TRAIL))
         self.connect()
         neighbours = np.flatnonzero(np.diff(laid) == 1)
         held = np.flatnonzero(anchor[laid] >= 0)
@@ -346,15 +350,12 @@ class PathGraph:
         length = np.hypot(*(self.vertices.position[pairs[:, 0]] - self.vertices.position[pairs[:, 1]]).T)
         self._insert(pairs, length, np.zeros(len(pairs)))
 
-    def _trail_vertices(self, points: np.ndarray) -> np.ndarray:
-        """Vertices (k,) at points (k, 2) of the trail: those of an earlier call, else new ones."""
+    def _laid_before(self, points: np.ndarray) -> np.ndarray:
+        """The vertices (k,) that an earlier call made of points (k, 2) of the trail, or -1."""
         n = self.n_vertices
         old = np.flatnonzero((self.vertices.kind[:n] == CORNER) & (self.vertices.shape.limit[:n] == TRAIL))
         known = {(x, y): v for v, (x, y) in zip(old.tolist(), self.vertices.position[old].tolist(), strict=True)}
-        ids = np.array([known.get((x, y), -1) for x, y in points.tolist()], np.int64)
-        fresh = ids < 0
-        ids[fresh] = self._new_vertices(points[fresh], Shapes.free(points[fresh], TRAIL))
-        return ids
+        return np.array([known.get((x, y), -1) for x, y in points.tolist()], np.int64)
 
     def neighbours(self, v: int) -> np.ndarray:
         """The vertices (k,) that open edges join to v."""
