@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, subtract
-from polyexplore_gym.exploration.segments import crossing, point_segment_distance
+from polyexplore_gym.exploration.scan_polygon import contains, inside_intervals, label_edges, open_edges, subtract
+from polyexplore_gym.exploration.segments import crossing, near_point, point_segment_distance
 from polyexplore_gym.exploration.tolerances import end_noise, noise_at
 
 _PARALLEL = 0.5
@@ -115,19 +115,30 @@ def _covered(ax, ay, bx, by, wall, margin):
 
 
 @njit(cache=True)
-def _take_off(ax, ay, bx, by, walls, margin, same_way, kept, n_kept):
+def boxes_of(segments, margin):
+    """The boxes (x0, y0, x1, y1) of segments (m, 4), each with a margin, m."""
+    out = np.empty(segments.shape)
+    for i in range(segments.shape[0]):
+        out[i, 0] = min(segments[i, 0], segments[i, 2]) - margin
+        out[i, 1] = min(segments[i, 1], segments[i, 3]) - margin
+        out[i, 2] = max(segments[i, 0], segments[i, 2]) + margin
+        out[i, 3] = max(segments[i, 1], segments[i, 3]) + margin
+    return out
+
+
+@njit(cache=True)
+def _take_off(ax, ay, bx, by, walls, boxes, margin, same_way, kept, n_kept, cut):
     """Take off the intervals `kept` of a-b what walls along it cover; `same_way`: only those that run as a-b does."""
-    x0 = min(ax, bx) - margin
-    x1 = max(ax, bx) + margin
-    y0 = min(ay, by) - margin
-    y1 = max(ay, by) + margin
-    cut = np.empty((1, 2))
+    x0 = min(ax, bx)
+    x1 = max(ax, bx)
+    y0 = min(ay, by)
+    y1 = max(ay, by)
     for w in range(walls.shape[0]):
         if (
-            max(walls[w, 0], walls[w, 2]) < x0
-            or min(walls[w, 0], walls[w, 2]) > x1
-            or max(walls[w, 1], walls[w, 3]) < y0
-            or min(walls[w, 1], walls[w, 3]) > y1
+            boxes[w, 2] < x0
+            or boxes[w, 0] > x1
+            or boxes[w, 3] < y0
+            or boxes[w, 1] > y1
             or (same_way and (walls[w, 2] - walls[w, 0]) * (bx - ax) + (walls[w, 3] - walls[w, 1]) * (by - ay) <= 0.0)
         ):
             continue
@@ -162,21 +173,11 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
     """
     m = pieces.shape[0]
     reach = tol.max_range + tol.gap
-    near = np.empty(max(last - first, 1), np.int64)
-    n_near = 0
-    if m > 0:
-        x0 = min(pieces[:, 0].min(), pieces[:, 2].min()) - reach
-        x1 = max(pieces[:, 0].max(), pieces[:, 2].max()) + reach
-        y0 = min(pieces[:, 1].min(), pieces[:, 3].min()) - reach
-        y1 = max(pieces[:, 1].max(), pieces[:, 3].max()) + reach
-        for s in range(first, last):
-            if x0 <= scans.apexes[s, 0] <= x1 and y0 <= scans.apexes[s, 1] <= y1:
-                near[n_near] = s
-                n_near += 1
     out = np.empty((2 * m + 64, 4))
     origin = np.empty(out.shape[0], np.int64)
     changed = np.zeros(m, np.bool_)
     cut = np.empty((scans.angles.size + 2, 2))
+    boxes = boxes_of(walls, tol.cover)
     count = 0
     for i in range(m):
         ax, ay, bx, by = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
@@ -188,8 +189,15 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
         kept[0, 0] = 0.0
         kept[0, 1] = 1.0
         n_kept = 1
-        for q in range(n_near):
-            s = near[q]
+        # The point that must be seen lies no farther beyond the piece than this.
+        beyond = tol.nudge + 2.0 * max(sigma[i], noise_at(reach, tol))
+        x0 = min(ax, bx) - beyond
+        x1 = max(ax, bx) + beyond
+        y0 = min(ay, by) - beyond
+        y1 = max(ay, by) + beyond
+        for s in range(last - 1, first - 1, -1):  # the latest look was from near by
+            if scans.boxes[s, 2] < x0 or scans.boxes[s, 0] > x1 or scans.boxes[s, 3] < y0 or scans.boxes[s, 1] > y1:
+                continue
             px = scans.apexes[s, 0]
             py = scans.apexes[s, 1]
             away = point_segment_distance(px, py, ax, ay, bx, by)
@@ -198,6 +206,13 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
             nudge = (tol.nudge + 2.0 * max(sigma[i], noise_at(away, tol))) / size
             ox = nudge * (by - ay)
             oy = nudge * (ax - bx)
+            if (
+                max(ax, bx) + ox < scans.boxes[s, 0]
+                or min(ax, bx) + ox > scans.boxes[s, 2]
+                or max(ay, by) + oy < scans.boxes[s, 1]
+                or min(ay, by) + oy > scans.boxes[s, 3]
+            ):
+                continue
             n_cut = inside_intervals(
                 ax + ox - px, ay + oy - py, bx + ox - px, by + oy - py,
                 scans.points[s], scans.rays[s], scans.angles, scans.headings[s], scans.full, cut,
@@ -206,7 +221,7 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
             if n_kept == 0:
                 break
         if n_kept > 0:
-            kept, n_kept = _take_off(ax, ay, bx, by, walls, tol.cover, False, kept, n_kept)
+            kept, n_kept = _take_off(ax, ay, bx, by, walls, boxes, tol.cover, False, kept, n_kept, cut)
         if n_kept != 1 or kept[0, 0] > 1e-9 or kept[0, 1] < 1.0 - 1e-9:
             changed[i] = True
         for r in range(n_kept):
@@ -230,6 +245,8 @@ def clip_known(pieces, known, margin, shortest):
     m = pieces.shape[0]
     out = np.empty((2 * m + 64, 4))
     origin = np.empty(out.shape[0], np.int64)
+    cut = np.empty((1, 2))
+    boxes = boxes_of(known, margin)
     count = 0
     for i in range(m):
         ax, ay, bx, by = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
@@ -237,7 +254,7 @@ def clip_known(pieces, known, margin, shortest):
         kept = np.empty((1, 2))
         kept[0, 0] = 0.0
         kept[0, 1] = 1.0
-        kept, n_kept = _take_off(ax, ay, bx, by, known, margin, True, kept, 1)
+        kept, n_kept = _take_off(ax, ay, bx, by, known, boxes, margin, True, kept, 1, cut)
         for r in range(n_kept):
             whole = kept[r, 1] - kept[r, 0] == 1.0
             if not whole and (kept[r, 1] - kept[r, 0]) * size < shortest:
@@ -715,3 +732,105 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
         out.normal[q, 0] = cy / chord
         out.normal[q, 1] = -cx / chord
     return out
+
+
+@njit(cache=True)
+def _total(segments):
+    """Length of segments (m, 4) together."""
+    total = 0.0
+    for i in range(segments.shape[0]):
+        total += _size(segments[i])
+    return total
+
+
+@njit(cache=True)
+def take_in(s, ranges, point_segment, scans, pieces, walls, target, halves, max_visits, next_id, tol):
+    """Take scan number `s`, with its ranges (n,) and the fitted segment (n,) of each, into the open edges.
+
+    `walls` (w, 4) are those near it. The pieces of the chain `target` count so many `halves` of a visit more.
+    Returns the pieces, the new chains and whose rest they are (see `rechain`), and whether it showed anything new.
+    """
+    x, y = scans.apexes[s]
+    reach = tol.max_range + tol.gap
+    labels = label_edges(ranges, point_segment, scans.full, tol)
+    seen, kinds, sigmas = open_edges(scans.points[s], labels, scans.full, tol)
+    for i in range(seen.shape[0]):
+        seen[i, 0] += x
+        seen[i, 1] += y
+        seen[i, 2] += x
+        seen[i, 3] += y
+    seen, origin, _ = clip(seen, sigmas, scans, 0, s, walls, tol)
+    kinds, sigmas = kinds[origin], sigmas[origin]
+
+    local = near_point(pieces.segments, np.ones(pieces.kind.size, np.bool_), x, y, reach)
+    before = pieces.segments[local]
+    kept, origin, changed = clip(before, pieces.sigma[local], scans, s, s + 1, walls, tol)
+    rows = local[origin]
+    rest, again = clip_known(seen, kept, tol.nudge + 2.0 * tol.sigma_range, tol.crumb)
+    looked_behind = shown(kept, pieces.sigma[rows], scans, s, walls, tol)
+    visits = pieces.visits.copy()
+    dirty = np.zeros(pieces.kind.size, np.bool_)
+    dirty[local] = changed
+    for k in range(rows.size):
+        if looked_behind[k] and not pieces.settled[rows[k]]:
+            dirty[rows[k]] = True
+    if target >= 0:
+        for i in range(pieces.owner.size):
+            if pieces.owner[i] == target:
+                visits[i] += halves
+                dirty[i] = True
+    useful = _total(rest) + _total(before) - _total(kept) >= 2.0 * tol.trifle
+    m = rest.shape[0]
+    if m == 0 and not dirty.any():
+        none = np.zeros(0, np.int64)
+        nothing = summarise(kept[:0], kinds[:0], none, none, np.zeros(1, np.int64), walls, next_id, tol)
+        return pieces, nothing, none, useful
+    left = Pieces(
+        kept, pieces.kind[rows], pieces.sigma[rows], visits[rows], pieces.settled[rows] | looked_behind,
+        pieces.retried[rows], rows,
+    )  # fmt: skip
+    fresh = Pieces(
+        rest, kinds[again], sigmas[again], np.zeros(m, np.int64), np.zeros(m, np.bool_), np.zeros(m, np.bool_),
+        np.full(m, -1, np.int64),
+    )  # fmt: skip
+    visited = Pieces(
+        pieces.segments, pieces.kind, pieces.sigma, visits, pieces.settled, pieces.retried, pieces.owner
+    )  # fmt: skip
+    after, chains, left_of = rechain(visited, dirty, local, left, fresh, walls, max_visits, next_id, tol)
+    return after, chains, left_of, useful
+
+
+@njit(cache=True)
+def succeed(owner, new, left_of, id_, middle, ends, least_width):
+    """Which chains (c,) stay, and what becomes of the `new` ones: the `owner` (m,) of pieces and `new.id` follow.
+
+    One that is the very same as a chain that goes is that chain: second, its row there for each of the new ones, or -1.
+    Else one that is what is left of a chain still has its name. Third, which of the new ones are jump edges of their
+    own: at least `least_width` wide.
+    """
+    staying = np.zeros(id_.size, np.bool_)
+    for q in range(id_.size):
+        for i in range(owner.size):
+            if owner[i] == id_[q]:
+                staying[q] = True
+                break
+    wide = np.flatnonzero(np.minimum(new.width, new.room) >= least_width)
+    gone = np.flatnonzero(~staying)
+    again = unchanged(new, wide, gone, middle, ends)
+    same_as = np.full(new.id.size, -1, np.int64)
+    for k in range(wide.size):
+        q = wide[k]
+        name = left_of[q]
+        if again[k] >= 0:
+            same_as[q] = again[k]
+            name = id_[again[k]]
+        if name >= 0:
+            for i in range(owner.size):
+                if owner[i] == new.id[q]:
+                    owner[i] = name
+            if again[k] < 0:
+                new.id[q] = name
+    for k in range(wide.size):
+        if again[k] >= 0:
+            staying[again[k]] = True
+    return staying, same_as, wide[again < 0]

@@ -17,7 +17,7 @@ from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
 from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph, way_back
 from polyexplore_gym.exploration.scan_polygon import Scans
-from polyexplore_gym.exploration.segments import segment_distance
+from polyexplore_gym.exploration.segments import near_point, segment_distance
 from polyexplore_gym.exploration.tolerances import end_noise, squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
@@ -36,25 +36,6 @@ _AHEAD = 0.5
 
 
 @njit(cache=True)
-def _near(segments, alive, x, y, reach):
-    """Living segments whose bounding box comes within `reach` of a point (in the maximum norm)."""
-    n = segments.shape[0]
-    rows = np.empty(n, np.int64)
-    count = 0
-    for i in range(n):
-        if (
-            alive[i]
-            and min(segments[i, 0], segments[i, 2]) <= x + reach
-            and max(segments[i, 0], segments[i, 2]) >= x - reach
-            and min(segments[i, 1], segments[i, 3]) <= y + reach
-            and max(segments[i, 1], segments[i, 3]) >= y - reach
-        ):
-            rows[count] = i
-            count += 1
-    return rows[:count].copy()
-
-
-@njit(cache=True)
 def _too_near(path, walls, least):
     """Whether a wall (m, 4) comes nearer to a path (k, 2) than `least`."""
     for i in range(path.shape[0] - 1):
@@ -70,11 +51,6 @@ def _too_near(path, walls, least):
             ):
                 return True
     return False
-
-
-def _length(segments: np.ndarray) -> float:
-    """Length of segments (m, 4) together, m."""
-    return float(np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]).sum())
 
 
 def _resampled(way: np.ndarray, step: float) -> np.ndarray:
@@ -184,6 +160,7 @@ class ExplorationMap:
         self._looks = np.zeros((16, 3))
         self._apexes = np.zeros((16, 2))
         self._headings = np.zeros(16)
+        self._boxes = np.zeros((16, 4))
         self._points = np.zeros((16, n, 2))
         self._rays = np.zeros((16, n, 2))
         self._angles = np.zeros(n)
@@ -212,7 +189,7 @@ class ExplorationMap:
         """The scan polygons so far (views)."""
         n = self.n_scans
         return Scans(
-            self._apexes[:n], self._headings[:n], self._points[:n], self._rays[:n], self._angles,
+            self._apexes[:n], self._headings[:n], self._boxes[:n], self._points[:n], self._rays[:n], self._angles,
             self.sensor.full_circle, self.sensor.max_range,
         )  # fmt: skip
 
@@ -239,7 +216,7 @@ class ExplorationMap:
             point_segment = np.full(len(scan.angles), -1, np.int64)
         self._remember(scan.pose)
         s = self._store(scan, ranges)
-        scans, tol, full = self.scans, self.tol, self.sensor.full_circle
+        tol = self.tol
         x, y = float(scan.pose[0]), float(scan.pose[1])
         reach = tol.max_range + tol.gap
         self._touched.append(touched)
@@ -247,39 +224,22 @@ class ExplorationMap:
             min(self._box[0], x - reach), min(self._box[1], y - reach),
             max(self._box[2], x + reach), max(self._box[3], y + reach),
         ])  # fmt: skip
-        near_walls = walls[_near(walls, alive, x, y, reach)]
-        labels = scan_polygon.label_edges(ranges, point_segment, full, tol)
-        fresh, kinds, sigmas = scan_polygon.open_edges(scans.points[s], labels, full, tol)
-        fresh += np.array([x, y, x, y])
-        fresh, origin, _ = jump_edges.clip(fresh, sigmas, scans, 0, s, near_walls, tol)
-        kinds, sigmas = kinds[origin], sigmas[origin]
-
-        p = self.pieces
-        local = _near(p.segments, np.ones(len(p.kind), np.bool_), x, y, reach)
-        kept, origin, changed = jump_edges.clip(p.segments[local], p.sigma[local], scans, s, s + 1, near_walls, tol)
-        rows = local[origin]
-        fresh, again = jump_edges.clip_known(fresh, kept, tol.nudge + 2.0 * tol.sigma_range, tol.crumb)
-        shown = jump_edges.shown(kept, p.sigma[rows], scans, s, near_walls, tol)
-        visits = p.visits.copy()
-        dirty = np.zeros(len(p.kind), np.bool_)
-        dirty[local[changed]] = True
-        dirty[rows[shown & ~p.settled[rows]]] = True
+        halves = 0
         if target is not None:
-            mine = p.owner == target
             if arrived and self._measured(target, x, y):
-                visits[mine] += VISIT
+                halves = VISIT
             elif not self._felt_again or self._stuck > _PATIENCE:
-                visits[mine] += 1  # else the spot is to blame, not the edge: what is felt closes it in the end
+                halves = 1  # else the spot is to blame, not the edge: what is felt closes it in the end
             self._stuck = self._stuck + 1 if self._felt_again else 0
             self._felt_again = False
-            dirty |= mine
-        p = p._replace(visits=visits)
-        left = Pieces(kept, p.kind[rows], p.sigma[rows], p.visits[rows], p.settled[rows] | shown, p.retried[rows], rows)
-        new = Pieces.none()._replace(segments=fresh, kind=kinds[again], sigma=sigmas[again])
-        if _length(fresh) + _length(p.segments[local]) - _length(kept) < 2.0 * tol.trifle:
+        near = walls[near_point(walls, alive, x, y, reach)]
+        pieces, opened, left_of, useful = jump_edges.take_in(
+            s, ranges, point_segment, self.scans, self.pieces, near, -1 if target is None else target, halves,
+            VISIT * self.config.max_visits, self._next_id, tol,
+        )  # fmt: skip
+        if not useful:
             self.n_scans -= 1  # its polygon lies within the others, but for slivers: kept, it would only cost memory
-        if len(fresh) or dirty.any():
-            self._rechain(p, dirty, local, left, new, near_walls)
+        self._take_over(pieces, opened, left_of)
         if target is not None:
             self._drop_nodes(np.flatnonzero(self.chains.id == target))  # the same place again would show no more
 
@@ -318,6 +278,7 @@ class ExplorationMap:
         if s == len(self._headings):
             self._apexes = np.concatenate((self._apexes, np.zeros_like(self._apexes)))
             self._headings = np.concatenate((self._headings, np.zeros_like(self._headings)))
+            self._boxes = np.concatenate((self._boxes, np.zeros_like(self._boxes)))
             self._points = np.concatenate((self._points, np.zeros_like(self._points)))
             self._rays = np.concatenate((self._rays, np.zeros_like(self._rays)))
         self._apexes[s] = scan.pose[:2]
@@ -326,35 +287,23 @@ class ExplorationMap:
         self._points[s], self._rays[s] = scan_polygon.corner_points(
             scan.angles, ranges, float(scan.pose[2]), self.tol.max_range
         )
+        self._boxes[s] = scan_polygon.box_of(self._points[s], *scan.pose[:2])
         self.n_scans += 1
         return s
 
-    def _rechain(
-        self, pieces: Pieces, dirty: np.ndarray, local: np.ndarray, left: Pieces, fresh: Pieces, walls: np.ndarray
-    ) -> None:
-        """Put what is left of the local pieces and the fresh ones in their place; make new chains where needed."""
-        done, opened, left_of = jump_edges.rechain(
-            pieces, dirty, local, left, fresh, walls, VISIT * self.config.max_visits, self._next_id, self.tol
+    def _take_over(self, pieces: Pieces, opened: Opened, left_of: np.ndarray) -> None:
+        """Make pieces and the chains that are new among them the map's own."""
+        self.pieces, c = pieces, self.chains
+        self._next_id += len(opened.id)
+        staying, same_as, new = jump_edges.succeed(
+            pieces.owner, opened, left_of, c.id, c.middle, c.ends, self.least_width
         )
-        self.pieces, new = Pieces(*done), Opened(*opened)
-        owner = self.pieces.owner
-        self._next_id += len(new.id)
-        c = self.chains
-        staying = np.isin(c.id, owner)
-        wide = np.flatnonzero(np.minimum(new.width, new.room) >= self.least_width)
-        gone = np.flatnonzero(~staying)
-        again = jump_edges.unchanged(new, wide, gone, c.middle, c.ends)
-        for q, row in zip(wide, again, strict=True):
-            if row >= 0:
-                owner[owner == new.id[q]] = c.id[row]
-                c.visits[row], c.kind[row] = -(-new.visits[q] // VISIT), new.kind[q]
-                staying[row] = True
-        for q in wide[again < 0]:  # what is left of a jump edge is still that one, at another node
-            if left_of[q] >= 0:
-                owner[owner == new.id[q]] = left_of[q]
-                new.id[q] = left_of[q]
-        self._drop_vertices(c.vertex[~staying])
-        self.chains = c.take(np.flatnonzero(staying)).join(JumpEdges.new(new, wide[again < 0]))
+        for q in np.flatnonzero(same_as >= 0):
+            c.visits[same_as[q]], c.kind[same_as[q]] = -(-opened.visits[q] // VISIT), opened.kind[q]
+        if not staying.all():
+            self._drop_vertices(c.vertex[~staying])
+            c = c.take(np.flatnonzero(staying))
+        self.chains = c.join(JumpEdges.new(opened, new)) if len(new) else c
 
     def _drop_nodes(self, which: np.ndarray) -> None:
         self._drop_vertices(self.chains.vertex[which])
@@ -510,8 +459,10 @@ class ExplorationMap:
         if not again.any():
             return False
         p = p._replace(visits=np.where(again, most - VISIT, p.visits), retried=p.retried | again)
-        all_of_them, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
-        self._rechain(p, all_of_them, none, Pieces.none(), Pieces.none(), self._walls)
+        everything, none = np.ones(len(p.kind), np.bool_), np.zeros(0, np.int64)
+        self._take_over(*jump_edges.rechain(
+            p, everything, none, Pieces.none(), Pieces.none(), self._walls, most, self._next_id, self.tol
+        ))  # fmt: skip
         return self.chains.size > 0
 
     def remains(self) -> Remains:

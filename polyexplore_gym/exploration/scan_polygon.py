@@ -24,6 +24,8 @@ class Scans(NamedTuple):
     """(s, 2) where each scan was made, m"""
     headings: np.ndarray
     """(s,) rad"""
+    boxes: np.ndarray
+    """(s, 4) x0, y0, x1, y1 of the polygon, m"""
     points: np.ndarray
     """(s, n, 2) corners about the apex, m"""
     rays: np.ndarray
@@ -37,8 +39,9 @@ class Scans(NamedTuple):
 
 
 EVERYTHING = Scans(
-    np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.array([0.0, 1.0]), False, 0.0
-)
+    np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.array([0.0, 1.0]),
+    False, 0.0,
+)  # fmt: skip
 """No limit to what is known."""
 
 
@@ -60,6 +63,19 @@ def corner_points(angles, ranges, heading, max_range):
         points[k, 0] = r * c
         points[k, 1] = r * s
     return points, rays
+
+
+@njit(cache=True)
+def box_of(points, x, y):
+    """The box (x0, y0, x1, y1) of a scan polygon with corners (n, 2) about its apex (x, y)."""
+    x0 = y0 = x1 = y1 = 0.0
+    for k in range(points.shape[0]):
+        x0 = min(x0, points[k, 0])
+        y0 = min(y0, points[k, 1])
+        x1 = max(x1, points[k, 0])
+        y1 = max(y1, points[k, 1])
+    spare = 1e-9 * (x1 - x0 + y1 - y0)  # rounding must not take a corner out
+    return np.array([x + x0 - spare, y + y0 - spare, x + x1 + spare, y + y1 + spare])
 
 
 @njit(cache=True)
@@ -303,13 +319,14 @@ def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
 def is_known(x, y, scans, since):
     """Whether a point lies in a scan polygon from number `since` on; the newest are tried first."""
     for s in range(scans.headings.size - 1, since - 1, -1):
-        dx = x - scans.apexes[s, 0]
-        dy = y - scans.apexes[s, 1]
         if (
-            abs(dx) <= scans.reach
-            and abs(dy) <= scans.reach
-            and contains(dx, dy, scans.points[s], scans.angles, scans.headings[s], scans.full)
-        ):
+            scans.boxes[s, 0] <= x <= scans.boxes[s, 2]
+            and scans.boxes[s, 1] <= y <= scans.boxes[s, 3]
+            and contains(
+                x - scans.apexes[s, 0], y - scans.apexes[s, 1], scans.points[s], scans.angles, scans.headings[s],
+                scans.full,
+            )
+        ):  # fmt: skip
             return True
     return False
 

@@ -73,6 +73,25 @@ def segment_distance(ax, ay, bx, by, cx, cy, dx, dy):
     return min(d, point_segment_distance(dx, dy, ax, ay, bx, by))
 
 
+@njit(cache=True)
+def near_point(segments, alive, x, y, reach):
+    """Rows of the living segments (m, 4) whose box comes within `reach` of a point (in the maximum norm)."""
+    n = segments.shape[0]
+    rows = np.empty(n, np.int64)
+    count = 0
+    for i in range(n):
+        if (
+            alive[i]
+            and min(segments[i, 0], segments[i, 2]) <= x + reach
+            and max(segments[i, 0], segments[i, 2]) >= x - reach
+            and min(segments[i, 1], segments[i, 3]) <= y + reach
+            and max(segments[i, 1], segments[i, 3]) >= y - reach
+        ):
+            rows[count] = i
+            count += 1
+    return rows[:count].copy()
+
+
 @njit(cache=True, inline="always")
 def bucket(ix, iy, mask):
     """Hash of a grid cell."""
