@@ -20,6 +20,8 @@ _PARALLEL = 0.5
 """Sine of the largest angle between a wall and an open edge that it covers."""
 _MAX_TURN = 1.3
 """A chain that turns farther (rad) than this from its beginning is cut: its parts face different ways."""
+_ALIKE = 0.27
+"""Cosine of the largest angle (that of `_MAX_TURN`) between the directions in which parts of one opening face."""
 _SQUARE = 0.26
 """Cosine of the largest incidence (75 degrees) under which a look shows what is behind an open edge."""
 _LOOKS = 2
@@ -423,6 +425,9 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
     rows = np.flatnonzero(stale)
     order, offsets = link(p.segments[rows], p.sigma[rows], walls, tol)
     new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
+    order, offsets, joined, other = join(p.segments[rows], order, offsets, new, walls, tol)
+    if other:
+        new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
     keep = np.ones(n, np.bool_)
     for i in range(n):
         keep[i] = not p.settled[i] or _size(p.segments[i]) >= tol.trifle
@@ -432,7 +437,7 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         left_of[q] = _most_of(p.segments, owner_before, members, ids, size_before)
         for i in members:
             p.owner[i] = new.id[q]
-            keep[i] = new.width[q] >= tol.trifle
+            keep[i] = new.width[q] >= tol.trifle or joined[q]
     arranged = np.concatenate((np.flatnonzero(~stale), rows[order]))
     arranged = arranged[keep[arranged]]
     return (
@@ -741,6 +746,102 @@ def _total(segments):
     for i in range(segments.shape[0]):
         total += _size(segments[i])
     return total
+
+
+@njit(cache=True)
+def _one_opening(a, b, new, walls, tol):
+    """Whether chains a and b face the same way and one goes on where the other is, with no wall between."""
+    if new.normal[a, 0] * new.normal[b, 0] + new.normal[a, 1] * new.normal[b, 1] < _ALIKE:
+        return False
+    ends = new.ends
+    best = tol.gap
+    x = y = 0.0
+    for p, q in ((a, b), (b, a)):
+        x0, y0, x1, y1 = ends[q]
+        for e in range(0, 4, 2):
+            px = ends[p, e]
+            py = ends[p, e + 1]
+            if px < min(x0, x1) - best or px > max(x0, x1) + best or py < min(y0, y1) - best or py > max(y0, y1) + best:
+                continue
+            t = (px - x0) * (x1 - x0) + (py - y0) * (y1 - y0)
+            t = min(max(t / max((x1 - x0) ** 2 + (y1 - y0) ** 2, 1e-300), 0.0), 1.0)
+            qx = x0 + t * (x1 - x0)
+            qy = y0 + t * (y1 - y0)
+            d = math.hypot(px - qx, py - qy)
+            if d < best:
+                best = d
+                x = 0.5 * (px + qx)
+                y = 0.5 * (py + qy)
+    if best >= tol.gap:
+        return False
+    return best < tol.cover or not _walled(x, y, x, y, walls, tol)
+
+
+@njit(cache=True)
+def join(segments, order, offsets, new, walls, tol):
+    """Make one chain of all that are narrow by themselves but parts of one opening: scans on the way past a corner cut
+    its boundary into splinters that lie beside each other.
+
+    The chains (c,) are given as by `link`, with what `summarise` says of them as `new`. Returns order and offsets,
+    which of the chains have others beside them, and whether any are joined.
+    """
+    c = offsets.size - 1
+    label = np.arange(c)
+    beside = np.zeros(c, np.bool_)
+    narrow = new.width < tol.gap
+    for a in range(c):
+        for b in range(a):
+            if not (narrow[a] or narrow[b]) or (narrow[a] and narrow[b] and label[a] == label[b]):
+                continue
+            if not _one_opening(a, b, new, walls, tol):
+                continue
+            beside[a] = beside[b] = True
+            if narrow[a] and narrow[b]:
+                low, high = min(label[a], label[b]), max(label[a], label[b])
+                for k in range(c):
+                    if label[k] == high:
+                        label[k] = low
+    arranged = np.empty_like(order)
+    begins = np.empty(order.size + 1, np.int64)
+    joined = np.zeros(order.size, np.bool_)
+    count = 0
+    chains = 0
+    other = False
+    for a in range(c):
+        if label[a] != a:
+            continue
+        begin = count
+        nx = ny = 0.0
+        for b in range(a, c):
+            if label[b] == a:
+                nx += new.length[b] * new.normal[b, 0]
+                ny += new.length[b] * new.normal[b, 1]
+                for e in range(offsets[b], offsets[b + 1]):
+                    arranged[count] = order[e]
+                    count += 1
+        several = count - begin > offsets[a + 1] - offsets[a]
+        if several:
+            other = True
+            # The unknown lies on the right: along the opening is to the left of its normal.
+            along = np.empty(count - begin)
+            for k in range(count - begin):
+                i = arranged[begin + k]
+                along[k] = (segments[i, 1] + segments[i, 3]) * nx - (segments[i, 0] + segments[i, 2]) * ny
+            arranged[begin:count] = arranged[begin:count][np.argsort(along, kind="mergesort")]
+        begins[chains] = begin
+        joined[chains] = beside[a]
+        chains += 1
+        for k in range(begin + 1, count):
+            i = arranged[k - 1]
+            j = arranged[k]
+            ax, ay, bx, by = segments[i, 2], segments[i, 3], segments[j, 0], segments[j, 1]
+            d = math.hypot(bx - ax, by - ay)
+            if several and (d >= tol.gap or (d >= tol.join and _walled(ax, ay, bx, by, walls, tol))):
+                begins[chains] = k  # what lies beside each other by way of a third need not go on from each other
+                joined[chains] = True
+                chains += 1
+    begins[chains] = count
+    return arranged, begins[: chains + 1].copy(), joined[:chains].copy(), other
 
 
 @njit(cache=True)

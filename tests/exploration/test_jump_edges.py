@@ -422,3 +422,33 @@ def test_what_is_left_of_a_jump_edge_is_still_that_one():
             kept += wanted >= 0
             lost += wanted < 0
     assert min(kept, lost) > 50
+
+
+def test_splinters_beside_each_other_are_one_opening():
+    tol = EXACT._replace(gap=0.5, join=0.05, cover=0.04)
+    # Up along x = 0, each a little aside of the last and partly beside it: none alone is as wide as the gap.
+    low = np.array([0.0, 0.25, 0.5, 0.75])
+    up = np.stack([0.03 * np.arange(4) % 0.06, low, 0.03 * np.arange(4) % 0.06, low + 0.35], axis=1)
+    back = np.array([[0.1, 0.6, 0.1, 0.3]])  # the other side of a sliver faces the other way
+    pieces = np.concatenate([up[[2, 0, 3, 1]], back])
+
+    def openings(walls):
+        order, offsets = np.arange(5), np.arange(6)
+        kinds, visits = np.ones(5, np.int8), np.zeros(5, np.int64)
+        new = je.summarise(pieces, kinds, visits, order, offsets, walls, 0, tol)
+        order, offsets, joined, other = je.join(pieces, order, offsets, new, walls, tol)
+        assert sorted(order.tolist()) == [0, 1, 2, 3, 4]
+        new = je.summarise(pieces, kinds, visits, order, offsets, walls, 0, tol)
+        parts = [order[a:b].tolist() for a, b in itertools.pairwise(offsets)]
+        return parts, new.width, joined.tolist(), other
+
+    parts, width, joined, other = openings(NO_WALLS)
+    assert other
+    assert parts == [[1, 3, 0, 2], [4]]
+    assert width[0] == pytest.approx(1.1, abs=0.01)
+    assert joined == [True, False]
+    pieces = pieces[:4] + np.array([0.0, 1.0, 0.0, 1.0]) * np.array([[0.4], [0.0], [0.4], [0.0]])
+    pieces = np.concatenate([pieces, back])
+    across = np.array([[-0.3, 0.75, 0.3, 0.75]])  # a wall between the lower two and the upper two
+    assert openings(NO_WALLS)[0] == [[1, 3, 0, 2], [4]]
+    assert openings(across)[0] == [[0, 2], [1, 3], [4]]
