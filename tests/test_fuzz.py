@@ -100,3 +100,10 @@ def test_scans_on_the_way_do_not_whittle_an_opening_away(fuzz, number):
     _, _, result = fuzz.run(fuzz.case_of(number))
     assert result["kind"] == "complete"
     assert result["seen"] > 99.0
+
+
+def test_the_way_back_round_a_wall_end_is_found(fuzz):
+    """With beams far apart the map has no way out of the doorway by which the robot came: only the way driven."""
+    _, _, result = fuzz.run(fuzz.case_of(1615))
+    assert result["kind"] == "complete"
+    assert result["seen"] > 99.0

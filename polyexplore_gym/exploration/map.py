@@ -17,7 +17,7 @@ from polyexplore_gym.exploration import jump_edges, nodes, scan_polygon
 from polyexplore_gym.exploration.jump_edges import Opened, Pieces
 from polyexplore_gym.exploration.path_graph import PathGraph, way_back
 from polyexplore_gym.exploration.scan_polygon import Scans
-from polyexplore_gym.exploration.segments import near_point, segment_distance
+from polyexplore_gym.exploration.segments import near_point, point_segment_distance, segment_distance
 from polyexplore_gym.exploration.tolerances import end_noise, squeezed, tolerances
 from polyexplore_gym.scan import Scan
 
@@ -53,11 +53,47 @@ def _too_near(path, walls, least):
     return False
 
 
-def _resampled(way: np.ndarray, step: float) -> np.ndarray:
-    """Points (k, 2) of a way every `step` m, and the last: the same ones again when the way has grown."""
-    run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))))
-    at = np.append(np.arange(0.0, run[-1], step), run[-1])
-    return np.stack((np.interp(at, run, way[:, 0]), np.interp(at, run, way[:, 1])), axis=1)
+@njit(cache=True)
+def _thinned(way, step, off):
+    """Points (p, 2) of a way (k, 2) between which it is straight to `off` m: farther apart than `step` m only where
+    the way has no points between."""
+    n = 1
+    moved = way.copy()
+    for k in range(1, way.shape[0]):
+        if math.hypot(way[k, 0] - moved[n - 1, 0], way[k, 1] - moved[n - 1, 1]) > 0.5 * off:  # not on the spot
+            moved[n] = way[k]
+            n += 1
+    last = way[-1]
+    way = moved[:n]
+    out = np.empty((n + 1, 2))
+    out[0] = way[0]
+    count = 1
+    first = 0
+    for k in range(2, n):
+        ax, ay = way[first]
+        bx, by = way[k]
+        good = math.hypot(bx - ax, by - ay) <= step
+        for i in range(first + 1, k):
+            good = good and point_segment_distance(way[i, 0], way[i, 1], ax, ay, bx, by) <= off
+        if not good:
+            first = k - 1
+            out[count] = way[first]
+            count += 1
+    out[count] = last
+    return out[: count + 1].copy()
+
+
+def _resampled(way: np.ndarray, step: float, off: float) -> np.ndarray:
+    """Points (p, 2) at most `step` m apart of a way (k, 2) that is straight between them to `off` m, and the last.
+
+    The same ones again when the way has grown.
+    """
+    corners = _thinned(way, step, off)
+    legs = np.diff(corners, axis=0)
+    parts = np.maximum(np.ceil(np.hypot(*legs.T) / step), 1.0).astype(np.int64)
+    share = (np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)) / np.repeat(parts, parts)
+    between = np.repeat(corners[:-1], parts, axis=0) + share[:, None] * np.repeat(legs, parts, axis=0)
+    return np.concatenate((between, corners[-1:]))
 
 
 class JumpEdges(NamedTuple):
@@ -442,7 +478,8 @@ class ExplorationMap:
         self._place(np.flatnonzero(local))
         self._update_paths()
         if c.size and not self.reachable.any() and self._trail:
-            g.add_trail(_resampled(np.concatenate(self._trail), self.tol.trail_step)[-_LONGEST_TRAIL:], self.robot)
+            way = _resampled(np.concatenate(self._trail), self.tol.trail_step, self.tol.still)
+            g.add_trail(way[-_LONGEST_TRAIL:], self.robot)
             self._update_paths()
             local[:] = True
         self._place_within(np.flatnonzero(local & ~self.reachable), last=not self.reachable.any())

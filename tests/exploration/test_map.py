@@ -12,6 +12,7 @@ from exploration_scenes import box, clear_points, free_space, lines_of, room_of,
 
 from polyexplore_gym.config import ExplorationConfig, SensorConfig
 from polyexplore_gym.exploration import ExplorationMap, scan_polygon, shapes
+from polyexplore_gym.exploration import map as exploration_map
 from polyexplore_gym.exploration.tolerances import squeezed
 from polyexplore_gym.floorplan import generate
 from polyexplore_gym.scan import Scan
@@ -542,3 +543,20 @@ def test_a_doorway_closed_by_noise_is_squeezed_through_when_nothing_else_is_in_r
     explorer.plan()
     assert explorer.map.reachable.any()
     assert explorer.map.graph is explorer.map._wide
+
+
+def test_the_way_back_is_the_way_driven():
+    """Its points are no farther apart than asked for, it cuts no corner, and it grows at its end only."""
+    rng = np.random.default_rng(4)
+    for n in rng.integers(1, 300, 60):
+        heading = np.cumsum(rng.normal(0.0, 0.15, n))
+        speed = rng.choice([0.0, 0.01, 0.04, 0.9], n, p=[0.2, 0.4, 0.38, 0.02])  # also on the spot, and in one go
+        way = np.cumsum(np.stack([speed * np.cos(heading), speed * np.sin(heading)], axis=1), axis=0)
+        points = exploration_map._resampled(way, 0.3, 0.004)
+        np.testing.assert_array_equal(points[[0, -1]], way[[0, -1]])
+        assert np.hypot(*np.diff(points, axis=0).T).max(initial=0.0) <= 0.3 + 1e-9
+        line = shapely.LineString(np.concatenate([points, points[-1:]]))
+        assert shapely.distance(line, shapely.points(way)).max() < 0.004 + 0.5 * 0.004 + 1e-9
+        before = exploration_map._resampled(way[: 2 * n // 3 + 1], 0.3, 0.004)
+        known = {tuple(point) for point in points.round(9)}
+        assert sum(tuple(point) not in known for point in before.round(9)) <= 4  # those of the last leg
