@@ -107,3 +107,10 @@ def test_the_way_back_round_a_wall_end_is_found(fuzz):
     _, _, result = fuzz.run(fuzz.case_of(1615))
     assert result["kind"] == "complete"
     assert result["seen"] > 99.0
+
+
+def test_single_returns_do_not_close_a_doorway(fuzz):
+    """Beams far apart see jambs as specks, as wide as they stand in the map by convention: 72 % were seen."""
+    _, _, result = fuzz.run(fuzz.case_of(793))
+    assert result["seen"] > 99.0
+    assert result["left"] <= 1.0
