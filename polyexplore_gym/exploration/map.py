@@ -451,6 +451,8 @@ class ExplorationMap:
         if at != (x, y):
             self._start.insert(0, (x, y))
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
+        if g.clearance(*self._start[-1]) < self.tol.need:
+            g.join_trail(self.robot, g.trail_at(*self._start[-1]))
         c = self.chains
         reach = self.tol.max_range
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
@@ -497,11 +499,14 @@ class ExplorationMap:
         """The first way points: the place itself or, in contact with a wall, on to where paths begin.
 
         That is a place near by or, in a passage as wide as the robot, back on the way that it came, past earlier bumps
-        in the same passage but not round and round between them.
+        in the same passage but not round and round between them. Where the graph has that way already paths begin at
+        once: back first and then forward again the robot would never get through while it decides on the way.
         """
         rx, ry, found = self.graph.retreat(x, y)
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
+        if len(self.graph.trail_at(x, y)):
+            return [(x, y)]
         last, length = [], 0
         for way in reversed(self._trail):
             last.append(way[::-1])
