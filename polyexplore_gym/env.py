@@ -242,7 +242,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             if i:
                 self._turn(heading + i * 2.0 * math.pi / turns)
             self._measure()
-        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive)
+        lines = self._lines
+        self._exploration.plan(self._pose_model.estimate, lines.segments, lines.alive, lone=lines.lone)
 
     def _go(self, row: int) -> None:
         """Drive to a node and measure there, on the way too if so configured; and plan anew."""
@@ -282,7 +283,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
                 return "settled"
             if c.decide == "interval" and self._distance - start >= c.decide_every - 1e-9:
                 return "interval"
-            if exploration.blocked(path, self._lines.segments, self._lines.alive):
+            if exploration.blocked(path, self._lines.segments, self._lines.alive, self._lines.lone):
                 self._update()
                 row = np.flatnonzero(exploration.chains.id == target)
                 if not len(row) or not exploration.reachable[row[0]]:
@@ -332,7 +333,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         came = to_estimated(np.concatenate((*self._trajectory[self._parts :], self._world.pose[None]))[:, :2])
         self._parts = len(self._trajectory)
         halt = to_estimated(self._world.halt[None])[0]
-        self._exploration.plan(self._pose_model.estimate, self._lines.segments, self._lines.alive, came, halt)
+        lines = self._lines
+        self._exploration.plan(self._pose_model.estimate, lines.segments, lines.alive, came, halt, lines.lone)
 
     def _follow(self, way: np.ndarray) -> None:
         """Advance the estimated pose along true poses (m, 3); in the mode slam it is corrected on the way."""

@@ -204,7 +204,7 @@ class ExplorationMap:
         self.chains = JumpEdges.new(_nothing(), np.zeros(0, np.int64))
         self.graph = self._wide = PathGraph(self.tol)
         self._tight: PathGraph | None = None
-        """Paths through passages that the noise closes: made when nothing else is in reach."""
+        """Paths through passages that noise or the space between beams closes: made when nothing else is in reach."""
         self._tight_touched: list[np.ndarray] = []
         self.robot = -1
         self._start: list[tuple[float, float]] = []
@@ -389,11 +389,13 @@ class ExplorationMap:
         alive: np.ndarray,
         came: np.ndarray | None = None,
         halt: np.ndarray | None = None,
+        lone: np.ndarray | None = None,
     ) -> None:
         """Bring nodes, gains and shortest paths up to date for a robot at the estimated `pose` (3,).
 
         `came` (k, 2) is the way that it came, the way back out of a tight place. `halt` (2,) is where a robot that
-        moves can come to rest at the earliest: paths lead there first.
+        moves can come to rest at the earliest: paths lead there first. `lone` (m,) is that of the line map: which walls
+        stand for a single return.
         """
         if came is not None:
             self._trail.append(came)
@@ -407,7 +409,7 @@ class ExplorationMap:
             self._tight_touched.append(touched)
         self._plan(pose)
         while not self.reachable.any():
-            if self.chains.size and self._squeeze(pose, walls, alive):
+            if self.chains.size and self._squeeze(pose, walls, alive, lone):
                 break
             again = self._look_again()
             self._switch(self._wide)
@@ -438,8 +440,8 @@ class ExplorationMap:
         self.graph = graph
         self._box = _EVERYWHERE
 
-    def _squeeze(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> bool:
-        """Look for ways through passages that the noise of the map closes. Whether one leads to a node."""
+    def _squeeze(self, pose: np.ndarray, walls: np.ndarray, alive: np.ndarray, lone: np.ndarray | None) -> bool:
+        """Look for ways through passages that noise or the space between beams closes. Whether one leads to a node."""
         if self._tight is None:
             self._tight = PathGraph(squeezed(self.tol))
             self._tight_touched = [np.arange(len(walls))]
@@ -447,10 +449,23 @@ class ExplorationMap:
                 self._put_felt(self._tight, *felt)
         touched = np.unique(np.concatenate(self._tight_touched)) if self._tight_touched else np.zeros(0, np.int64)
         self._switch(self._tight)
-        self._show(self._tight, self._shortened(walls), alive, touched, _EVERYWHERE)
+        self._show(self._tight, *self._certain(walls, alive, lone), touched, _EVERYWHERE)
         self._tight_touched = []
         self._plan(pose)
         return bool(self.reachable.any())
+
+    def _certain(self, walls: np.ndarray, alive: np.ndarray, lone: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Walls (m, 4) as short as they may be, and which there are: those about a lone return shrink to it.
+
+        Such a wall is as wide as its beam, across it: by half of that it may stick out of a wall seen at a slant.
+        """
+        certain = self._shortened(walls)
+        if lone is None:
+            return certain, alive
+        about = np.isfinite(lone)
+        way = walls[about, 2:] - walls[about, :2]
+        certain[about] = np.tile(walls[about, :2] + lone[about, None] * way, 2)
+        return certain, alive & ~(about & ((lone < 0.0) | (lone > 1.0)))
 
     def _shortened(self, walls: np.ndarray) -> np.ndarray:
         """Walls (m, 4) less what noise may have added at their ends."""
@@ -472,6 +487,8 @@ class ExplorationMap:
         if at != (x, y):
             self._start.insert(0, (x, y))
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
+        if g.clearance(*self._start[-1]) < self.tol.need:
+            g.join_trail(self.robot, g.trail_at(*self._start[-1]))
         c = self.chains
         reach = self.tol.max_range
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)
@@ -519,11 +536,14 @@ class ExplorationMap:
         """The first way points: the place itself or, in contact with a wall, on to where paths begin.
 
         That is a place near by or, in a passage as wide as the robot, back on the way that it came, past earlier bumps
-        in the same passage but not round and round between them.
+        in the same passage but not round and round between them. Where the graph has that way already paths begin at
+        once: back first and then forward again the robot would never get through while it decides on the way.
         """
         rx, ry, found = self.graph.retreat(x, y)
         if found:
             return [(x, y)] if (rx, ry) == (x, y) else [(x, y), (rx, ry)]
+        if len(self.graph.trail_at(x, y)):
+            return [(x, y)]
         last, length = [], 0
         for way in reversed(self._trail):
             last.append(way[::-1])
@@ -587,10 +607,12 @@ class ExplorationMap:
         way = self.graph.path(self.robot, int(self.chains.vertex[i]))[::-1]
         return np.concatenate((np.array(self._start[:-1]).reshape(-1, 2), way))
 
-    def blocked(self, path: np.ndarray, walls: np.ndarray, alive: np.ndarray) -> bool:
+    def blocked(self, path: np.ndarray, walls: np.ndarray, alive: np.ndarray, lone: np.ndarray | None = None) -> bool:
         """Whether walls that came since the last `plan` leave the disc no room on a path (k, 2)."""
         if not self._touched:
             return False
+        if self.graph is self._tight:
+            walls, alive = self._certain(walls, alive, lone)
         rows = np.concatenate(self._touched)
         return bool(_too_near(path, walls[rows[alive[rows]]], self.tol.radius))
 

@@ -350,6 +350,25 @@ class PathGraph:
         length = np.hypot(*(self.vertices.position[pairs[:, 0]] - self.vertices.position[pairs[:, 1]]).T)
         self._insert(pairs, length, np.zeros(len(pairs)))
 
+    def trail_at(self, x: float, y: float) -> np.ndarray:
+        """The ends (k,) of those legs of the way laid by `add_trail` on which a place lies."""
+        n, position = self.n_vertices, self.vertices.position
+        laid = (self.vertices.kind[:n] == CORNER) & (self.vertices.shape.limit[:n] == TRAIL)
+        near = np.flatnonzero(laid & (np.abs(position[:n] - (x, y)) < self.tol.trail_edge).all(axis=1)).tolist()
+        ends = [
+            (u, v) for u in near for v in self.neighbours(u)
+            if v > u and laid[v] and point_segment_distance(x, y, *position[u], *position[v]) < self.tol.crumb
+        ]  # fmt: skip
+        return np.unique(np.array(ends, np.int64))
+
+    def join_trail(self, leaf: int, ends: np.ndarray) -> None:
+        """Join a leaf that stands on the way driven to vertices (k,) of it: it leads from there to both sides."""
+        self.connect()
+        known = self.neighbours(leaf)
+        pairs = np.array([(u, leaf) for u in ends if u not in known], np.int64).reshape(-1, 2)
+        length = np.hypot(*(self.vertices.position[pairs[:, 0]] - self.vertices.position[pairs[:, 1]]).T)
+        self._insert(pairs, length, np.zeros(len(pairs)))
+
     def _laid_before(self, points: np.ndarray) -> np.ndarray:
         """The vertices (k,) that an earlier call made of points (k, 2) of the trail, or -1."""
         n = self.n_vertices

@@ -42,6 +42,8 @@ class ScanLines:
     smoothed: np.ndarray
     """(n,) ranges, m, inf without a return, NaN where nothing is known; on a line, where the nominal beam meets it (raw
     above 80 degrees)."""
+    lone: np.ndarray | None = None
+    """(F,) which fragments stand for a lone return, that in their middle; None: none."""
 
 
 def extract_lines(
@@ -274,7 +276,7 @@ def _assemble(
     min_points: int,
     min_length: float,
     grouping: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Labelled returns to the fields of `ScanLines`."""
     var_range, var_angle = sigma_range * sigma_range, sigma_angle * sigma_angle
     fits = fit_labels(x, y, label, count, var_range, var_angle)
@@ -286,7 +288,7 @@ def _assemble(
         x, y, beam, ranges, cos_t, sin_t, max_range, resolution, label, fits,
         sigma_range, sigma_angle, reach, min_points, min_length,
     )  # fmt: skip
-    fragments = fragment_chains(x, y, beam, where, resolution, fits, var_range, var_angle, reach)
+    fragments, alone = fragment_chains(x, y, beam, where, resolution, fits, var_range, var_angle, reach)
 
     number = np.full(count, -1, np.int64)
     lines = 0
@@ -320,4 +322,4 @@ def _assemble(
     segment_line = np.empty(owner.size, np.int64)
     for k in range(owner.size):
         segment_line[k] = number[owner[k]]
-    return rho, alpha, covariance, segments, segment_line, point_segment, fragments, smoothed
+    return rho, alpha, covariance, segments, segment_line, point_segment, fragments, smoothed, alone

@@ -98,15 +98,16 @@ def fragment_chains(
     var_range: float,
     var_angle: float,
     door: float,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """(F, 4) pieces covering the returns with where < 0; a lone return gives a piece of its beam's width, `WIDEST` at
-    most. Returns a door's width apart are not joined.
+    most, about it: second, (F,) which these are. Returns a door's width apart are not joined.
 
     fits: (count, 9) of `grouping.fit_labels`. What lies on one of these lines, where returns are too far apart to be
     its wall, gives a piece along it.
     """
     m = x.size
     out = np.empty((m, 4))
+    alone = np.zeros(m, np.bool_)
     count = 0
     noise = 3.0 * math.sqrt(2.0 * var_range)
     k = 0
@@ -121,8 +122,9 @@ def fragment_chains(
                 break
             stop += 1
         if stop == k:
+            alone[count] = True
             count = beside(x[k], y[k], resolution, fits, var_range, var_angle, door, out, count)
         else:
             count = simplify(x, y, k, stop, var_range, var_angle, door, out, count)
         k = stop + 1
-    return out[:count].copy()
+    return out[:count].copy(), alone[:count].copy()

@@ -88,6 +88,7 @@ class LineMap:
         information = np.linalg.pinv(covariance, hermitian=True) if drifting else np.zeros((3, 3))
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
+            np.zeros(len(lines.fragments), np.bool_) if lines.lone is None else lines.lone,
             pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
             self.config.straightness, self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
             self._rows, self._lines, self._grid, slots,
@@ -130,6 +131,12 @@ class LineMap:
     def sigma(self) -> np.ndarray:
         """(M,) standard deviation of a row across its direction, m."""
         return self._rows.sigma[: self._row_count]
+
+    @property
+    def lone(self) -> np.ndarray:
+        """(M,) of a fragment about a lone return, which is as wide as its beam: where on it the return lies, as a share
+        of its length, outside 0 to 1 if that part was known already; NaN for all other rows."""
+        return self._rows.lone[: self._row_count]
 
     @property
     def rho(self) -> np.ndarray:
@@ -216,6 +223,7 @@ def _rows(n: int) -> Rows:
         np.zeros(n),
         np.full(n, -1, np.int64),
         np.zeros(n, np.int64),
+        np.full(n, np.nan),
     )
 
 

@@ -414,6 +414,7 @@ def insert(
     segments: np.ndarray,
     segment_line: np.ndarray,
     fragments: np.ndarray,
+    lone: np.ndarray,
     pose: np.ndarray,
     pose_covariance: np.ndarray,
     var_range: float,
@@ -587,6 +588,8 @@ def insert(
             continue
         row = new_row(rows, slots)
         rows.line[row], rows.side[row], rows.next[row], rows.sigma[row] = -1, 0, -1, sigma
+        if lone[k]:
+            rows.lone[row] = (0.5 - a) / (b - a)
         clip(piece, a, b)
         rows.ends[row] = piece
         rows.end_variance[row] = sigma * sigma

@@ -35,6 +35,9 @@ class Rows(NamedTuple):
     """(M,) next row on the same line, -1 at the end."""
     touched: np.ndarray
     """(M,) number of the insert that touched the row last."""
+    lone: np.ndarray
+    """(M,) of a fragment that stands for a lone return: where on it that lies, as a share of its length, outside 0 to 1
+    if that part was known already; NaN for all others."""
 
 
 class Lines(NamedTuple):
@@ -148,6 +151,7 @@ def new_row(rows: Rows, slots: Slots) -> int:
     row = slots.rows[slots.counts[0]]
     rows.alive[row] = True
     rows.segments[row] = math.inf
+    rows.lone[row] = math.nan
     return row
 
 

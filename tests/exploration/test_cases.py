@@ -113,6 +113,14 @@ def test_doors_little_wider_than_the_robot(width, placement):
     check(episode(rooms_with_doors(width), exploration={"placement": placement}))
 
 
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_doors_little_wider_than_the_robot_between_sparse_beams(placement):
+    """The pieces about lone returns, as wide as their beams, stick out of the walls and into the doors."""
+    sensor = {"beams": 25, "field_of_view": 2 * math.pi, "max_range": 30.0, "sigma_range": 0.0, "sigma_angle": 0.0}
+    plan = rooms_with_doors(0.53)
+    check(episode(plan, start=(2.5, 2.5, 0.0), sensor=sensor, exploration={"placement": placement}))
+
+
 def test_a_start_against_a_wall_without_looking_around():
     check(episode(hall(6, 5), start=(0.26, 2.5, math.pi), exploration={"look_around": False}))
 

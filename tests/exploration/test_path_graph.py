@@ -419,6 +419,23 @@ def test_a_trail_laid_again_is_the_same_trail_and_leads_back():
     assert len(np.unique(laid, axis=0)) == len(laid)
 
 
+def test_a_robot_on_a_trail_that_was_laid_goes_on_to_both_sides():
+    """In a passage that the map closes it went back first, and then forward again: decision by decision, for ever."""
+    side = TOL.sweep - 0.02
+    graph = graph_of(np.vstack((box(-3.0, -2.0, 6.0, 2.0), [[0.0, side, 3.0, side], [0.0, -side, 3.0, -side]])))
+    way = np.stack((np.linspace(-1.5, 4.5, 21), np.zeros(21)), axis=1)
+    robot = leaf(graph, *way[-1], owner=-2)
+    nodes = [leaf(graph, *way[0], owner=7), leaf(graph, *way[-1], owner=8)]
+    graph.connect()
+    graph.add_trail(way, robot)
+    graph.remove_leaves(np.array([robot]))
+    assert not len(graph.trail_at(1.4, 0.5))
+    robot = leaf(graph, 1.4, 0.0, owner=-2)
+    graph.join_trail(robot, graph.trail_at(1.4, 0.0))
+    graph.set_sources(np.array([robot]))
+    assert graph.distances(robot, np.array(nodes)) == pytest.approx([2.9, 3.1], abs=0.1)
+
+
 def test_edges_in_the_graph_keep_clear_of_walls_that_came_later():
     """Every open edge keeps its clearance to all living walls, whatever came and went."""
     rng = np.random.default_rng(5)
