@@ -178,6 +178,7 @@ class PathGraph:
         self.dist = np.full((16, 256), math.inf)
         self.parent = np.full((16, 256), -1, np.int32)
         self.felt = 0
+        self._has_trail = False
         self._segments = np.zeros((0, 4))
         self._alive = np.zeros(0, np.bool_)
         self._touched_felt = np.zeros(0, np.int64)
@@ -330,6 +331,7 @@ class PathGraph:
 
         Only the points that no corner can stand for are laid, and those between two parts of the graph.
         """
+        self._has_trail = True
         anchor = self._laid_before(points)
         new = anchor < 0
         anchor[new] = anchors(points[new], self.vertices, self.n_vertices, self.walls, self.pieces, self.tol)
@@ -353,6 +355,8 @@ class PathGraph:
 
     def trail_at(self, x: float, y: float) -> np.ndarray:
         """The ends (k,) of those edges from the way laid by `add_trail` on which a place lies."""
+        if not self._has_trail:
+            return np.zeros(0, np.int64)
         return trail_under(x, y, self.vertices, self.n_vertices, self.links, self.tol)
 
     def join_trail(self, leaf: int, ends: np.ndarray) -> None:
