@@ -221,7 +221,7 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
                 continue
             n_cut = inside_intervals(
                 ax + ox - px, ay + oy - py, bx + ox - px, by + oy - py,
-                scans.points[s], scans.rays[s], scans.angles, scans.headings[s], scans.full, cut,
+                scans.points[s], scans.rays[s], scans.blocks[s], scans.angles, scans.headings[s], scans.full, cut,
             )  # fmt: skip
             kept, n_kept = subtract(kept, n_kept, cut, n_cut)
             if n_kept == 0:
@@ -851,10 +851,11 @@ def join(segments, order, offsets, new, walls, tol):
 
 
 @njit(cache=True)
-def take_in(s, ranges, point_segment, scans, pieces, walls, target, halves, max_visits, next_id, tol):
+def take_in(s, ranges, point_segment, scans, pieces, walls, moved, target, halves, max_visits, next_id, tol):
     """Take scan number `s`, with its ranges (n,) and the fitted segment (n,) of each, into the open edges.
 
-    `walls` (w, 4) are those near it. The pieces of the chain `target` count so many `halves` of a visit more.
+    `walls` (w, 4) are those near it, `moved` (w,) tells which of them came or changed: the others have taken off what
+    they cover before. The pieces of the chain `target` count so many `halves` of a visit more.
     Returns the pieces, the new chains and whose rest they are (see `rechain`), and whether it showed anything new.
     """
     x, y = scans.apexes[s]
@@ -871,7 +872,7 @@ def take_in(s, ranges, point_segment, scans, pieces, walls, target, halves, max_
 
     local = near_point(pieces.segments, np.ones(pieces.kind.size, np.bool_), x, y, reach)
     before = pieces.segments[local]
-    kept, origin, changed = clip(before, pieces.sigma[local], scans, s, s + 1, walls, tol)
+    kept, origin, changed = clip(before, pieces.sigma[local], scans, s, s + 1, walls[moved], tol)
     rows = local[origin]
     rest, again = clip_known(seen, kept, tol.nudge + 2.0 * tol.sigma_range, tol.crumb)
     looked_behind = shown(kept, pieces.sigma[rows], scans, s, walls, tol)

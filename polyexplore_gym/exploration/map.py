@@ -199,6 +199,7 @@ class ExplorationMap:
         self._boxes = np.zeros((16, 4))
         self._points = np.zeros((16, n, 2))
         self._rays = np.zeros((16, n, 2))
+        self._blocks = np.zeros((16, n // scan_polygon.BLOCK + 1, 2))
         self._angles = np.zeros(n)
         self.pieces = Pieces.none()
         self.chains = JumpEdges.new(_nothing(), np.zeros(0, np.int64))
@@ -225,8 +226,8 @@ class ExplorationMap:
         """The scan polygons so far (views)."""
         n = self.n_scans
         return Scans(
-            self._apexes[:n], self._headings[:n], self._boxes[:n], self._points[:n], self._rays[:n], self._angles,
-            self.sensor.full_circle, self.sensor.max_range,
+            self._apexes[:n], self._headings[:n], self._boxes[:n], self._points[:n], self._rays[:n], self._blocks[:n],
+            self._angles, self.sensor.full_circle, self.sensor.max_range,
         )  # fmt: skip
 
     def insert(
@@ -268,10 +269,10 @@ class ExplorationMap:
                 halves = 1  # else the spot is to blame, not the edge: what is felt closes it in the end
             self._stuck = self._stuck + 1 if self._felt_again else 0
             self._felt_again = False
-        near = walls[near_point(walls, alive, x, y, reach)]
+        near = near_point(walls, alive, x, y, reach)
         pieces, opened, left_of, useful = jump_edges.take_in(
-            s, ranges, point_segment, self.scans, self.pieces, near, -1 if target is None else target, halves,
-            VISIT * self.config.max_visits, self._next_id, tol,
+            s, ranges, point_segment, self.scans, self.pieces, walls[near], np.isin(near, touched),
+            -1 if target is None else target, halves, VISIT * self.config.max_visits, self._next_id, tol,
         )  # fmt: skip
         if not useful:
             self.n_scans -= 1  # its polygon lies within the others, but for slivers: kept, it would only cost memory
@@ -317,6 +318,7 @@ class ExplorationMap:
             self._boxes = np.concatenate((self._boxes, np.zeros_like(self._boxes)))
             self._points = np.concatenate((self._points, np.zeros_like(self._points)))
             self._rays = np.concatenate((self._rays, np.zeros_like(self._rays)))
+            self._blocks = np.concatenate((self._blocks, np.zeros_like(self._blocks)))
         self._apexes[s] = scan.pose[:2]
         self._headings[s] = scan.pose[2]
         self._angles = scan.angles
@@ -324,6 +326,7 @@ class ExplorationMap:
             scan.angles, ranges, float(scan.pose[2]), self.tol.max_range
         )
         self._boxes[s] = scan_polygon.box_of(self._points[s], *scan.pose[:2])
+        self._blocks[s] = scan_polygon.block_distances(self._points[s])
         self.n_scans += 1
         return s
 

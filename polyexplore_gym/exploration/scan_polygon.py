@@ -12,9 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from polyexplore_gym.exploration.segments import point_segment_distance
 from polyexplore_gym.exploration.tolerances import noise_at
 
 WALL, JUMP, RANGE, VIEW = 0, 1, 2, 3
+BLOCK = 8
+"""So many neighbouring sectors are passed at once where a segment is nearer or farther than their whole boundary."""
 
 
 class Scans(NamedTuple):
@@ -30,6 +33,8 @@ class Scans(NamedTuple):
     """(s, n, 2) corners about the apex, m"""
     rays: np.ndarray
     """(s, n, 2) unit vectors of the beams"""
+    blocks: np.ndarray
+    """(s, b, 2) nearest and farthest distance of the boundary in blocks of sectors, m"""
     angles: np.ndarray
     """(n,) of the beams in the robot's frame, rad"""
     full: bool
@@ -39,8 +44,8 @@ class Scans(NamedTuple):
 
 
 EVERYTHING = Scans(
-    np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.array([0.0, 1.0]),
-    False, 0.0,
+    np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)),
+    np.zeros((0, 1, 2)), np.array([0.0, 1.0]), False, 0.0,
 )  # fmt: skip
 """No limit to what is known."""
 
@@ -76,6 +81,27 @@ def box_of(points, x, y):
         y1 = max(y1, points[k, 1])
     spare = 1e-9 * (x1 - x0 + y1 - y0)  # rounding must not take a corner out
     return np.array([x + x0 - spare, y + y0 - spare, x + x1 + spare, y + y1 + spare])
+
+
+@njit(cache=True)
+def block_distances(points):
+    """Nearest and farthest distance from the apex (b, 2) of the boundary with corners (n, 2), `BLOCK` sectors each.
+
+    The sector from the last beam to the first is in none.
+    """
+    n = points.shape[0]
+    out = np.empty((n // BLOCK + 1, 2))
+    for b in range(out.shape[0]):
+        near = math.inf
+        far = 0.0
+        for k in range(BLOCK * b, min(BLOCK * (b + 1), n - 1)):
+            ax, ay = points[k]
+            bx, by = points[k + 1]
+            near = min(near, point_segment_distance(0.0, 0.0, ax, ay, bx, by))
+            far = max(far, math.hypot(ax, ay), math.hypot(bx, by))
+        out[b, 0] = near
+        out[b, 1] = far
+    return out
 
 
 @njit(cache=True)
@@ -234,7 +260,11 @@ def open_edges(points, labels, full, tol):
 def sector_of(x, y, angles, heading, full):
     """Index k of the sector between beams k and k + 1 that holds a point; n - 1 is what lies behind."""
     n = angles.size
-    theta = (math.atan2(y, x) - heading - angles[0]) % (2.0 * math.pi)
+    theta = math.atan2(y, x) - heading - angles[0]
+    if theta < 0.0:  # most headings need no more than this, and remainders take long
+        theta += 2.0 * math.pi
+    if theta < 0.0 or theta >= 2.0 * math.pi:
+        theta %= 2.0 * math.pi
     span = angles[n - 1] - angles[0]
     if theta > span:
         # Behind a partial field of view, or the closing sector of a full circle.
@@ -261,33 +291,84 @@ def contains(x, y, points, angles, heading, full):
 
 
 @njit(cache=True)
-def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
+def _next_ray(ax, ay, dx, dy, ux, uy, turn, t):
+    """Where (t in [0, 1]) a segment that turns as the sign of `turn` about the apex meets a ray; 1 where it ends
+    before."""
+    c = ux * dy - uy * dx
+    if (turn > 0 and c > 0) or (turn < 0 and c < 0):
+        s = -(ux * ay - uy * ax) / c
+        if s < 1.0 and ux * (ax + s * dx) + uy * (ay + s * dy) > 0.0:
+            return max(s, t)
+    return 1.0
+
+
+@njit(cache=True)
+def _add_interval(lo, hi, out, count):
+    """Append an interval that begins at or after the end of the last; returns the new number."""
+    if hi <= lo:
+        return count
+    if count > 0 and lo - out[count - 1, 1] <= 1e-9:
+        out[count - 1, 1] = hi
+        return count
+    out[count, 0] = lo
+    out[count, 1] = hi
+    return count + 1
+
+
+@njit(cache=True)
+def _beside(ax, ay, dx, dy, lo, hi, near, far):
+    """1 if the part from lo to hi of a segment is nearer to the apex than `near`, -1 if farther than `far`, else 0."""
+    x0, y0 = ax + lo * dx, ay + lo * dy
+    x1, y1 = ax + hi * dx, ay + hi * dy
+    if max(x0 * x0 + y0 * y0, x1 * x1 + y1 * y1) < (1.0 - 1e-9) * near * near:
+        return 1
+    if point_segment_distance(0.0, 0.0, x0, y0, x1, y1) > (1.0 + 1e-9) * far:
+        return -1
+    return 0
+
+
+@njit(cache=True)
+def inside_intervals(ax, ay, bx, by, points, rays, blocks, angles, heading, full, out):
     """Parts of the segment a-b (about the apex) inside the scan polygon, as intervals of [0, 1].
 
     Walks through the sectors between neighbouring beams; within one the boundary is a line, so the
-    crossing is exact. Writes (lo, hi) rows to `out` (n + 2 or more) and returns how many.
+    crossing is exact. Blocks of sectors are passed at once where the segment is nearer or farther than all of their
+    boundary. Writes (lo, hi) rows to `out` (n + 2 or more) and returns how many.
     """
     n = angles.size
     dx = bx - ax
     dy = by - ay
     turn = ax * dy - ay * dx
-    tiny = 1e-12 * (abs(dx) + abs(dy))
+    radial = abs(turn) <= 1e-12 * (abs(dx) + abs(dy))
+    by_block = BLOCK * (angles[n - 1] - angles[0]) < 0.5 * math.pi * (n - 1)
     k = sector_of(ax, ay, angles, heading, full)
     t = 0.0
     count = 0
-    for _ in range(n + 2):
+    tried = -1  # the block whose sectors are looked at one by one
+    for _ in range(2 * n + 2):
+        block = k // BLOCK
+        if by_block and not radial and k < n - 1 and block != tried:
+            tried = block
+            first = BLOCK * block
+            last = min(first + BLOCK, n - 1) - 1
+            ray = last + 1 if turn > 0 else first
+            end = _next_ray(ax, ay, dx, dy, rays[ray, 0], rays[ray, 1], turn, t)
+            beside = _beside(ax, ay, dx, dy, t, end, blocks[block, 0], blocks[block, 1])
+            if beside != 0:
+                if beside > 0:
+                    count = _add_interval(t, end, out, count)
+                k = last if turn > 0 else first
+                if end >= 1.0:
+                    break
+                t = end
+                k = k + 1 if turn > 0 else (k - 1 if k > 0 else n - 1)
+                continue
+        j = k + 1 if k < n - 1 else 0
         end = 1.0
-        if abs(turn) > tiny:
-            ray = (k + 1) % n if turn > 0 else k
-            ux = rays[ray, 0]
-            uy = rays[ray, 1]
-            c = ux * dy - uy * dx
-            if (turn > 0 and c > 0) or (turn < 0 and c < 0):
-                s = -(ux * ay - uy * ax) / c
-                if s < 1.0 and ux * (ax + s * dx) + uy * (ay + s * dy) > 0.0:
-                    end = max(s, t)
+        if not radial:
+            ray = j if turn > 0 else k
+            end = _next_ray(ax, ay, dx, dy, rays[ray, 0], rays[ray, 1], turn, t)
         if full or k != n - 1:
-            j = (k + 1) % n
             ex = points[j, 0] - points[k, 0]
             ey = points[j, 1] - points[k, 1]
             base = ex * (ay - points[k, 1]) - ey * (ax - points[k, 0])
@@ -301,17 +382,11 @@ def inside_intervals(ax, ay, bx, by, points, rays, angles, heading, full, out):
                     lo = min(max(-base / slope, lo), hi)
                 elif f_hi < 0.0:
                     hi = min(max(-base / slope, lo), hi)
-                if hi > lo:
-                    if count > 0 and lo - out[count - 1, 1] <= 1e-9:
-                        out[count - 1, 1] = hi
-                    else:
-                        out[count, 0] = lo
-                        out[count, 1] = hi
-                        count += 1
+                count = _add_interval(lo, hi, out, count)
         if end >= 1.0:
             break
         t = end
-        k = (k + 1) % n if turn > 0 else (k - 1) % n
+        k = j if turn > 0 else (k - 1 if k > 0 else n - 1)
     return count
 
 

@@ -32,7 +32,8 @@ def scans(rng, count, fov, n=80, spread=3.0):
         corners = apexes[s] + (points[s] if full else np.vstack([[0.0, 0.0], points[s]]))
         areas.append(shapely.Polygon(corners))
     boxes = np.array([sp.box_of(p, *a) for p, a in zip(points, apexes, strict=True)])
-    return sp.Scans(apexes, headings, boxes, points, rays, angles, full, 8.0), areas
+    blocks = np.array([sp.block_distances(p) for p in points])
+    return sp.Scans(apexes, headings, boxes, points, rays, blocks, angles, full, 8.0), areas
 
 
 def random_pieces(rng, m, half=6.0):
@@ -388,7 +389,8 @@ def test_a_look_along_a_wall_shows_nothing_in_its_doorway():
         ranges = [shapely.Point(apex).distance(shapely.union(lines, behind).intersection(line)) for line in far]
         points, rays = sp.corner_points(angles, np.minimum(np.nan_to_num(ranges, nan=8.0), 8.0), math.pi, 8.0)
         box = sp.box_of(points, *apex)[None]
-        look = sp.Scans(np.array([apex]), np.array([math.pi]), box, points[None], rays[None], angles, False, 8.0)
+        blocks = sp.block_distances(points)[None]
+        look = sp.Scans(np.array([apex]), np.array([math.pi]), box, points[None], rays[None], blocks, angles, False, 8.0)
         assert je.shown(edge, np.zeros(1), look, 0, jambs, tol).tolist() == [counts]
 
 

@@ -33,7 +33,7 @@ def random_scan(rng, fov):
 
 def inside(a, b, points, rays, angles, heading, full):
     out = np.empty((64, 2))
-    n = sp.inside_intervals(*a, *b, points, rays, angles, heading, full, out)
+    n = sp.inside_intervals(*a, *b, points, rays, sp.block_distances(points), angles, heading, full, out)
     return out[:n]
 
 
