@@ -390,14 +390,16 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         np.zeros(n, np.bool_), np.full(n, -1, np.int64),
     )  # fmt: skip
     stale = np.ones(n, np.bool_)
-    ids = np.unique(pieces.owner)
-    row = np.searchsorted(ids, pieces.owner)
-    lost = np.zeros(ids.size, np.bool_)
-    size_before = np.zeros(ids.size)
+    row = np.empty(m, np.int64)  # of the chain: its pieces are together
+    for i in range(m):
+        row[i] = 0 if i == 0 else row[i - 1] + (pieces.owner[i] != pieces.owner[i - 1])
+    lost = np.zeros(m, np.bool_)
+    size_before = np.zeros(m)
     for i in range(m):
         if dirty[i]:
             lost[row[i]] = True
-        size_before[row[i]] += _size(pieces.segments[i])
+        size_before[row[i]] += _size(pieces.segments, i)
+    row_before = np.full(n, -1)
     at = 0
     k = 0
     for i in range(m):  # in the old order: the pieces of a chain stay in theirs
@@ -405,13 +407,13 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
             p.segments[at] = pieces.segments[i]
             p.kind[at], p.sigma[at], p.visits[at] = pieces.kind[i], pieces.sigma[i], pieces.visits[i]
             p.settled[at], p.retried[at], p.owner[at] = pieces.settled[i], pieces.retried[i], pieces.owner[i]
-            stale[at] = dirty[i]
+            stale[at], row_before[at] = dirty[i], row[i]
             at += 1
         while k < left.kind.size and left.owner[k] == i:
             p.segments[at] = left.segments[k]
             p.kind[at], p.sigma[at], p.visits[at] = left.kind[k], left.sigma[k], left.visits[k]
             p.settled[at], p.retried[at], p.owner[at] = left.settled[k], left.retried[k], pieces.owner[i]
-            stale[at] = dirty[i]
+            stale[at], row_before[at] = dirty[i], row[i]
             at += 1
             k += 1
     for k in range(fresh.kind.size):
@@ -420,7 +422,7 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         at += 1
     owner_before = p.owner.copy()
     for i in range(n):
-        if p.owner[i] >= 0 and lost[np.searchsorted(ids, p.owner[i])]:
+        if p.owner[i] >= 0 and lost[row_before[i]]:
             stale[i] = True
         if p.settled[i] or p.visits[i] >= max_visits:
             p.owner[i] = -1
@@ -436,11 +438,11 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
         new = summarise(p.segments[rows], p.kind[rows], p.visits[rows], order, offsets, walls, next_id, tol)
     keep = np.ones(n, np.bool_)
     for i in range(n):
-        keep[i] = not p.settled[i] or _size(p.segments[i]) >= tol.trifle
+        keep[i] = not p.settled[i] or _size(p.segments, i) >= tol.trifle
     left_of = np.full(new.id.size, -1, np.int64)
     for q in range(new.id.size):
         members = rows[order[offsets[q] : offsets[q + 1]]]
-        left_of[q] = _most_of(p.segments, owner_before, members, ids, size_before)
+        left_of[q] = _most_of(p.segments, owner_before, members, row_before, size_before)
         for i in members:
             p.owner[i] = new.id[q]
             keep[i] = new.width[q] >= tol.trifle or joined[q]
@@ -457,25 +459,25 @@ def rechain(pieces, dirty, local, left, fresh, walls, max_visits, next_id, tol):
 
 
 @njit(cache=True)
-def _size(segment):
-    return math.hypot(segment[2] - segment[0], segment[3] - segment[1])
+def _size(segments, i):
+    return math.hypot(segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1])
 
 
 @njit(cache=True)
-def _most_of(segments, owner, members, ids, size_before):
-    """The owner that most of the members (k,) had, if they are also most of what that of `ids` (o,) had; else -1."""
+def _most_of(segments, owner, members, row, size_before):
+    """The owner that most of the members (k,) had, if they are also most of what it had: `size_before` at its row."""
     total = 0.0
     for i in members:
-        total += _size(segments[i])
+        total += _size(segments, i)
     for i in members:
         if owner[i] < 0:
             continue
         share = 0.0
         for j in members:
             if owner[j] == owner[i]:
-                share += _size(segments[j])
+                share += _size(segments, j)
         if 2.0 * share > total:
-            return owner[i] if 2.0 * share > size_before[np.searchsorted(ids, owner[i])] else -1
+            return owner[i] if 2.0 * share > size_before[row[i]] else -1
     return -1
 
 
@@ -750,7 +752,7 @@ def _total(segments):
     """Length of segments (m, 4) together."""
     total = 0.0
     for i in range(segments.shape[0]):
-        total += _size(segments[i])
+        total += _size(segments, i)
     return total
 
 

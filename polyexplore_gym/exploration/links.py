@@ -189,14 +189,31 @@ def _hit(ax, ay, bx, by, length, want, walls, discs):
 
 
 @njit(cache=True)
+def detach(vertices, n_vertices, links):
+    """Remove all edges of vertices that are gone. Returns the open edges (k, 2) that were cut."""
+    cut = np.empty((64, 2), np.int64)
+    count = 0
+    for v in range(n_vertices):
+        if vertices.kind[v] >= 0 or links.degree[v] == 0:
+            continue
+        while cut.shape[0] < count + links.degree[v]:
+            cut = np.concatenate((cut, np.empty_like(cut)))
+        for h in range(links.first[v], links.first[v] + links.degree[v]):
+            cut[count, 0] = v
+            cut[count, 1] = links.target[h]
+            count += 1
+            _cut(links.target[h], v, links)
+        links.degree[v] = 0
+    return cut[:count].copy()
+
+
+@njit(cache=True)
 def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
     """Remove the corners and edges that new walls (m, 4) come too near to, and all edges of vertices that are gone.
 
     Returns the open edges (k, 2) that were cut, and which of the `blocked` ones (b, 2) are left.
     """
     position, shape, kind = vertices.position, vertices.shape, vertices.kind
-    cut = np.empty((256, 2), np.int64)
-    count = 0
     discs = np.empty((walls.shape[0], 3))
     x0 = y0 = math.inf
     x1 = y1 = -math.inf
@@ -216,15 +233,8 @@ def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
                 if point_segment_distance(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]) < tol.sweep:
                     kind[v] = -1
                     break
-        if kind[v] < 0 and links.degree[v] > 0:
-            while cut.shape[0] < count + links.degree[v]:
-                cut = np.concatenate((cut, np.empty_like(cut)))
-            for h in range(links.first[v], links.first[v] + links.degree[v]):
-                cut[count, 0] = v
-                cut[count, 1] = links.target[h]
-                count += 1
-                _cut(links.target[h], v, links)
-            links.degree[v] = 0
+    cut = detach(vertices, n_vertices, links)
+    count = cut.shape[0]
     keep = np.ones(blocked.shape[0], np.bool_)
     for e in range(blocked.shape[0]):
         u = blocked[e, 0]
@@ -259,7 +269,7 @@ def sever(vertices, n_vertices, links, blocked, blocked_want, walls, tol):
                 and _hit(ax, ay, bx, by, links.cost[h], links.want[h] - tol.still, walls, discs)
             ):
                 if count == cut.shape[0]:
-                    cut = np.concatenate((cut, np.empty_like(cut)))
+                    cut = np.concatenate((cut, np.empty((count + 64, 2), np.int64)))
                 cut[count, 0] = u
                 cut[count, 1] = v
                 count += 1

@@ -32,6 +32,7 @@ from polyexplore_gym.exploration.links import (
     anchors,
     components,
     connect,
+    detach,
     insert,
     isolate,
     repack,
@@ -290,7 +291,8 @@ class PathGraph:
             if self._added:
                 self.repair()
             v.kind[: self.n_vertices][gone] = -1
-            self._sever(np.zeros((0, 4)))
+            self._cut.append(detach(v, self.n_vertices, self.links))
+            self._keep_blocked(np.all(v.kind[self.blocked] >= 0, axis=1))
         self._new_vertices(candidates[new], Shapes(*shape).take(new), BEND)
 
     def clearance(self, x: float, y: float) -> float:
