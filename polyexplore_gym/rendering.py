@@ -380,15 +380,15 @@ def _apart(centres: np.ndarray, distance: float, keep_off: np.ndarray, keep_off_
 def _draw_text(snapshot: Snapshot, ax: Axes) -> None:
     below = [
         f"{snapshot.distance:.1f} m driven",
-        f"{snapshot.measurements} measurement{'s' * (snapshot.measurements != 1)}",
+        f"{snapshot.measurements} scan{'s' * (snapshot.measurements != 1)}",
     ]
     if snapshot.coverage is not None:
         below.append(f"{100 * snapshot.coverage:.0f} % seen")
     if len(snapshot.node_positions):
-        below.append(f"{int(snapshot.node_mask.sum())} of {len(snapshot.node_positions)} nodes reachable")
+        below.append(f"{int(snapshot.node_mask.sum())} of {len(snapshot.node_positions)} nodes in reach")
     style = {"xycoords": "axes fraction", "textcoords": "offset points", "color": _INK, "annotation_clip": False}
     ax.annotate(snapshot.title, (0, 1), (1, 6), size=9, weight="bold", va="bottom", **style)  # type: ignore[arg-type]
-    ax.annotate("   ·   ".join(below), (0, 0), (1, -5), size=8, va="top", **style)  # type: ignore[arg-type]
+    ax.annotate("  ·  ".join(below), (0, 0), (1, -5), size=8, va="top", **style)  # type: ignore[arg-type]
 
 
 def _draw_scale_bar(ax: Axes) -> None:

@@ -270,8 +270,10 @@ class ExplorationMap:
             self._stuck = self._stuck + 1 if self._felt_again else 0
             self._felt_again = False
         near = near_point(walls, alive, x, y, reach)
+        moved = np.zeros(len(walls), np.bool_)
+        moved[touched] = True
         pieces, opened, left_of, useful = jump_edges.take_in(
-            s, ranges, point_segment, self.scans, self.pieces, walls[near], np.isin(near, touched),
+            s, ranges, point_segment, self.scans, self.pieces, walls[near], moved[near],
             -1 if target is None else target, halves, VISIT * self.config.max_visits, self._next_id, tol,
         )  # fmt: skip
         if not useful:
