@@ -125,4 +125,5 @@ def chosen(log: LaserLog, keep: np.ndarray, broken: list[Broken]) -> LaserLog:
     for name in ("angles", "ranges", "beam_times"):
         value = getattr(log, name)
         fields[name] = None if value is None else tuple(value[k] for k in at)
-    return replace(log, **fields, broken=(*log.broken, *broken))
+    way = None if log.way is None else log.way._replace(scans=log.way.scans[at])
+    return replace(log, **fields, way=way, broken=(*log.broken, *broken))

@@ -1,0 +1,174 @@
+"""The pose graph: poses of scans, and measurements of one seen from another. Sparse least squares with a robust kernel.
+
+Steps are taken in the frame of each pose, by Levenberg and Marquardt's rule; the first pose is the frame and stays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import SuperLU, splu
+
+from polyexplore_gym.mapping.logs.poses import between, compose
+
+KERNEL = 2.0
+"""Scale of the robust kernel (Cauchy), standard deviations: a wrong loop loses its weight beyond."""
+ROUNDS = 100
+"""Most iterations."""
+SETTLED = 1e-6
+"""Relative decrease of the cost at which to stop."""
+DAMPING = 1e-8, 1e8
+"""Damping to begin with, and with which to give up."""
+COLUMNS = 768
+"""So many columns of the inverse are held at a time."""
+
+
+class Edges(NamedTuple):
+    """Measurements between scans, e of them."""
+
+    ends: np.ndarray
+    """(e, 2) indices i, j of the scans."""
+    measured: np.ndarray
+    """(e, 3) the pose of j seen from i: x, y (m), heading (rad)."""
+    information: np.ndarray
+    """(e, 3, 3) inverse of its covariance, in the frame of j."""
+    robust: np.ndarray
+    """(e,) whether it may be wrong altogether."""
+
+    @classmethod
+    def of(cls, rows: list[tuple[int, int, np.ndarray, np.ndarray, bool]]) -> Edges:
+        """Edges from rows (i, j, measured, information, robust)."""
+        if not rows:
+            return cls(np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, bool))
+        i, j, measured, information, robust = zip(*rows, strict=True)
+        return cls(np.stack([i, j], axis=1), np.array(measured), np.array(information), np.array(robust))
+
+
+def solve(poses: np.ndarray, edges: Edges) -> np.ndarray:
+    """(n, 3) the most likely poses; the first stays where it is.
+
+    Args:
+        poses: (n, 3) first guess: x, y (m), heading (rad).
+        edges: between them. All poses must hang together.
+    """
+    damping = DAMPING[0]
+    cost = _cost(poses, edges)
+    for _ in range(ROUNDS):
+        h, g = _normal(poses, edges)
+        while damping < DAMPING[1]:
+            step = np.zeros_like(poses)
+            step[1:] = _factor(h + sp.diags_array(damping * h.diagonal())).solve(-g).reshape(-1, 3)
+            moved = compose(poses, step)
+            now = _cost(moved, edges)
+            if now <= cost:
+                break
+            damping *= 10.0
+        else:
+            return poses
+        damping = max(0.1 * damping, DAMPING[0])
+        poses, settled, cost = moved, cost - now <= SETTLED * cost, now
+        if settled:
+            break
+    return poses
+
+
+def covariances(poses: np.ndarray, edges: Edges) -> np.ndarray:
+    """(n, 3, 3) covariance of each pose in the frame of the map, given the first: m2, m rad, rad2.
+
+    Args:
+        poses: (n, 3) of `solve`.
+        edges: that they were solved with.
+    """
+    n = 3 * (len(poses) - 1)
+    out = np.zeros((len(poses), 3, 3))
+    factor = _factor(_normal(poses, edges)[0]) if n else None
+    for begin in range(0, n, COLUMNS):
+        columns = np.arange(begin, min(begin + COLUMNS, n))
+        unit = np.zeros((n, columns.size))
+        unit[columns, columns - begin] = 1.0
+        assert factor is not None
+        block = factor.solve(unit)[columns].reshape(-1, 3, columns.size // 3, 3)
+        out[1 + columns[::3] // 3] = block[np.arange(len(block)), :, np.arange(len(block))]
+    return turned(0.5 * (out + out.transpose(0, 2, 1)), poses[:, 2])
+
+
+def local_covariances(poses: np.ndarray, edges: Edges) -> np.ndarray:
+    """(n, 3, 3) covariance of each pose in the frame of the map, given all others: m2, m rad, rad2.
+
+    It tells how well a scan fits the walls around it, and leaves out what it shares with its neighbours.
+
+    Args:
+        poses: (n, 3) of `solve`.
+        edges: that they were solved with.
+    """
+    i, j = edges.ends.T
+    _, first, second, weighted = _linear(poses, edges)
+    own = np.zeros((len(poses), 3, 3))
+    np.add.at(own, i, first.transpose(0, 2, 1) @ weighted @ first)
+    np.add.at(own, j, second.transpose(0, 2, 1) @ weighted @ second)
+    return turned(np.linalg.inv(own), poses[:, 2])
+
+
+def turned(covariance: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) covariances of poses, from their own frames to the one in which they have these headings (n,)."""
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.zeros((len(heading), 3, 3))
+    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, -s, s, c, 1.0
+    return turn @ covariance @ turn.transpose(0, 2, 1)
+
+
+def errors(poses: np.ndarray, edges: Edges) -> np.ndarray:
+    """(e,) squared error of each edge at these poses, in its standard deviations (Mahalanobis)."""
+    i, j = edges.ends.T
+    off = between(edges.measured, between(poses[i], poses[j]))
+    return np.einsum("ka,kab,kb->k", off, edges.information, off)
+
+
+def _cost(poses: np.ndarray, edges: Edges) -> float:
+    d2 = errors(poses, edges)
+    k2 = KERNEL * KERNEL
+    return float(np.where(edges.robust, k2 * np.log1p(d2 / k2), d2).sum())
+
+
+def _linear(poses: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Error (e, 3) of each edge, its derivatives (e, 3, 3) by steps of i and of j, its information, weighted."""
+    i, j = edges.ends.T
+    seen = between(poses[i], poses[j])
+    off = between(edges.measured, seen)
+    weight = 1.0 / (1.0 + np.where(edges.robust, errors(poses, edges) / KERNEL**2, 0.0))
+    c, s = np.cos(off[:, 2]), np.sin(off[:, 2])
+    second = np.zeros((len(off), 3, 3))
+    second[:, 0, 0], second[:, 0, 1], second[:, 1, 0], second[:, 1, 1], second[:, 2, 2] = c, -s, s, c, 1.0
+    # a step of i moves j, as seen from j, by the adjoint of the inverse of `seen`
+    c, s = np.cos(seen[:, 2]), np.sin(seen[:, 2])
+    x, y = -c * seen[:, 0] - s * seen[:, 1], s * seen[:, 0] - c * seen[:, 1]
+    back = np.zeros((len(off), 3, 3))
+    back[:, 0, 0], back[:, 0, 1], back[:, 0, 2] = c, s, y
+    back[:, 1, 0], back[:, 1, 1], back[:, 1, 2] = -s, c, -x
+    back[:, 2, 2] = 1.0
+    return off, -second @ back, second, weight[:, None, None] * edges.information
+
+
+def _normal(poses: np.ndarray, edges: Edges) -> tuple[sp.csc_array, np.ndarray]:
+    """Half the Hessian and the gradient of the cost by the steps of all poses but the first."""
+    i, j = edges.ends.T
+    off, first, second, weighted = _linear(poses, edges)
+    blocks, rows, columns = [], [], []
+    gradient = np.zeros_like(poses)
+    for a, by_a in ((i, first), (j, second)):
+        half = by_a.transpose(0, 2, 1) @ weighted
+        np.add.at(gradient, a, np.einsum("kab,kb->ka", half, off))
+        for b, by_b in ((i, first), (j, second)):
+            blocks.append(half @ by_b)
+            rows.append(3 * a[:, None, None] + np.arange(3)[None, :, None] + np.zeros((1, 1, 3), np.int64))
+            columns.append(3 * b[:, None, None] + np.arange(3)[None, None, :] + np.zeros((1, 3, 1), np.int64))
+    at = np.concatenate(rows).ravel(), np.concatenate(columns).ravel()
+    n = 3 * len(poses)
+    h = sp.coo_array((np.concatenate(blocks).ravel(), at), shape=(n, n)).tocsc()
+    return h[3:, 3:], gradient.ravel()[3:]
+
+
+def _factor(h: sp.csc_array) -> SuperLU:
+    return splu(h.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -1,0 +1,151 @@
+"""What odometry tells, and what is wrong with it: `way_of`, `calibrate`, `filled`.
+
+A robot's odometry errs in ways that stay the same: how far a turn of the wheels leads, how much one wheel leads beside
+the other, and where the laser sits on the robot. Held against the poses that scans gave they can be told (after Censi
+et al., "Simultaneous calibration of odometry and sensor parameters for mobile robots", T-RO 2013).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from polyexplore_gym.errors import InvalidLogError
+from polyexplore_gym.mapping.logs.poses import between, compose, wrap
+from polyexplore_gym.mapping.logs.record import LaserLog, Way
+
+STAMP = 0.01
+"""Equal stamps in a row stand for times within so much of each other, s."""
+LEAST_STEPS = 30
+"""Fewest steps to calibrate with."""
+LEAST_WAY = 10.0, 2.0 * np.pi
+"""They lead so far altogether, and turn so much, m and rad."""
+USUAL = 0.03, 0.02
+"""Errors that count as the rule, not as outliers, m and rad."""
+ALONG = 0.2
+"""An error of the odometry grows by a metre of way as by so many rad of turn."""
+
+
+class Calibration(NamedTuple):
+    """How odometry becomes the way of the laser."""
+
+    x: float = 0.0
+    """Where the laser sits before the point that the odometry follows, m; what the log says of it included."""
+    y: float = 0.0
+    """Beside it, to the left, m."""
+    along: float = 1.0
+    """Length of a step, by that of the odometry."""
+    turn: float = 1.0
+    """A turn, by that of the odometry."""
+    veer: float = 0.0
+    """And what a step turns beside, rad/m."""
+
+
+class Error(NamedTuple):
+    """What calibration leaves of the error of a step, standard deviations."""
+
+    xy: float
+    """m"""
+    heading: float
+    """rad"""
+
+
+def way_of(log: LaserLog) -> Way:
+    """The odometry of a log, with the scans in it.
+
+    Raises:
+        InvalidLogError: the log gives none.
+    """
+    if log.way is not None:
+        return log.way
+    if log.track is not None and log.times is not None:
+        stamps = np.union1d(log.track.times, log.times)
+        return Way(stamps, log.track.at(stamps), np.searchsorted(stamps, log.times))
+    odometry = log.poses if log.odometry is None and log.poses_are != "corrected" else log.odometry
+    if odometry is None:
+        raise InvalidLogError(f"no odometry to go by: {log.why or 'the log gives none'}; the scans alone may do: none")
+    stamps = np.full(len(log), np.nan) if log.times is None else log.times
+    return Way(stamps, odometry, np.arange(len(log)))
+
+
+def calibrated(poses: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """(m, 3) odometry (m, 3) with errors taken out, and of the laser; from the origin."""
+    step = between(poses[:-1], poses[1:])
+    turn = np.concatenate([[0.0], np.cumsum(calibration.turn * step[:, 2] + calibration.veer * step[:, 0])])
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = calibration.along * step[:, :2].T
+    x = np.concatenate([[0.0], np.cumsum(c[:-1] * dx - s[:-1] * dy)])
+    y = np.concatenate([[0.0], np.cumsum(s[:-1] * dx + c[:-1] * dy)])
+    at = calibration.x, calibration.y
+    return np.stack([x + c * at[0] - s * at[1], y + s * at[0] + c * at[1], turn], axis=1)
+
+
+def calibrate(way: Way, scans: np.ndarray, poses: np.ndarray) -> tuple[Calibration, Error]:
+    """What is wrong with odometry, from the poses that scans gave.
+
+    Args:
+        way: odometry.
+        scans: (k,) some of the scans.
+        poses: (k, 3) theirs.
+
+    Returns:
+        The calibration, and what error it leaves from one of these scans to the next. Without ways and turns that
+        would tell, nothing is calibrated.
+    """
+    at, told = way.scans[scans], between(poses[:-1], poses[1:])
+
+    def off(values: np.ndarray) -> np.ndarray:
+        corrected = calibrated(way.poses, Calibration(*values))[at]
+        return between(between(corrected[:-1], corrected[1:]), told)
+
+    values = np.array(Calibration())
+    long_enough = np.hypot(told[:, 0], told[:, 1]).sum() > LEAST_WAY[0] and np.abs(told[:, 2]).sum() > LEAST_WAY[1]
+    if len(told) >= LEAST_STEPS and long_enough:
+        scale = np.array([USUAL[0], USUAL[0], USUAL[1]])
+        begin = values + [0.01, 0.01, 0.0, 0.0, 0.01]  # off zero, for the differences
+        values = least_squares(lambda v: (off(v) / scale).ravel(), begin, loss="soft_l1").x
+    left = np.abs(off(values)) / 0.6745  # median absolute deviation of a Gaussian
+    xy = float(np.hypot(*np.median(left[:, :2], axis=0)) / np.sqrt(2.0)) if len(left) else 0.0
+    heading = float(np.median(left[:, 2])) if len(left) else 0.0
+    return Calibration(*values.tolist()), Error(max(xy, 0.5 * USUAL[0]), max(heading, 0.25 * USUAL[1]))
+
+
+def filled(odometry: np.ndarray, at: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(m, 3) poses all along a way, of which some are known.
+
+    Between two known poses the odometry leads from one to the other; what it misses by is spread over the way as it
+    goes and turns. Before the first and behind the last it leads on.
+
+    Args:
+        odometry: (m, 3) the way by odometry.
+        at: (k,) where on it poses are known; increasing.
+        poses: (k, 3) these.
+    """
+    m = len(odometry)
+    before = np.clip(np.searchsorted(at, np.arange(m), side="right") - 1, 0, len(at) - 1)
+    after = np.minimum(before + 1, len(at) - 1)
+    step = between(odometry[:-1], odometry[1:])
+    grown = np.concatenate([[0.0], np.cumsum(np.abs(step[:, 2]) + ALONG * np.hypot(step[:, 0], step[:, 1]))])
+    begin, end = grown[at[before]], grown[at[after]]
+    share = np.clip((grown - begin) / np.where(end > begin, end - begin, 1.0), 0.0, 1.0)[:, None]
+    a = compose(poses[before], between(odometry[at[before]], odometry))
+    b = compose(poses[after], between(odometry[at[after]], odometry))
+    last = np.arange(m)[:, None] >= at[-1]
+    out = np.where(last, a, a + share * (b - a))
+    out[:, 2] = np.where(last[:, 0], a[:, 2], a[:, 2] + share[:, 0] * wrap(b[:, 2] - a[:, 2]))
+    first = np.arange(m) < at[0]
+    out[first] = compose(poses[0], between(odometry[at[0]], odometry[first]))
+    out[:, 2] = wrap(out[:, 2])
+    out[at] = poses
+    return out
+
+
+def spread(stamps: np.ndarray) -> np.ndarray:
+    """(m,) stamps; of equal ones in a row each gets its own time, evenly within what they were rounded to."""
+    first = np.flatnonzero(np.concatenate([[True], np.diff(stamps) != 0.0]))
+    count = np.diff(np.append(first, len(stamps)))
+    rank = np.arange(len(stamps)) - np.repeat(first, count)
+    many = np.repeat(count, count)
+    return np.where(many > 1, stamps + STAMP * ((rank + 0.5) / many - 0.5), stamps)
