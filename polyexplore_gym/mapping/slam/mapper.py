@@ -207,7 +207,8 @@ def _edges(known: State) -> Edges:
 def _weak(step: np.ndarray) -> np.ndarray:
     """(3, 3) information of a step by raw odometry."""
     size = np.array([1.0, math.hypot(step[0], step[1]), abs(step[2])])
-    return np.diag([np.dot(RAW[0], size), np.dot(RAW[0], size), np.dot(RAW[1], size)]) ** -2.0
+    xy, heading = float(np.dot(RAW[0], size)), float(np.dot(RAW[1], size))
+    return np.diag([xy**-2, xy**-2, heading**-2])
 
 
 def _move(known: State, keys: np.ndarray) -> None:
