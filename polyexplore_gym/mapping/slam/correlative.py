@@ -50,7 +50,8 @@ class Found(NamedTuple):
     pose: np.ndarray
     """(3,) x, y, heading."""
     score: float
-    """Mean of the field over the returns, 0 to 1, without the penalty; -1: there are no returns."""
+    """Mean of the field over the returns, 0 to 1, without the penalty; -1: there are no returns, or no pose is good
+    enough. The pose is the guess then."""
 
 
 def field_of(points: np.ndarray) -> Field:
@@ -61,19 +62,24 @@ def field_of(points: np.ndarray) -> Field:
     return Field(_levels(points, corner, rows, columns, CELL, BLUR, LEVELS), corner)
 
 
-def search(field: Field, points: np.ndarray, window: Window) -> Found:
+def search(field: Field, points: np.ndarray, window: Window, least: float = -math.inf) -> Found:
     """The pose in a window from which returns fit a field best.
 
     Args:
         field: of `field_of`.
         points: (n, 2) returns in the frame of the scan, m.
         window: where to look. Translations go by cells, headings by what moves the farthest return by a cell.
+        least: poses whose score less the penalty is not above this are of no interest, which saves time.
     """
     if not len(points):
         return Found(window.guess.copy(), -1.0)
     headings = _headings(points, window)
     shifts = math.ceil(window.reach / CELL)
-    best, score = _search(field.levels, field.corner, points, window.guess, headings, shifts, window.penalty, CELL)
+    best, score = _search(
+        field.levels, field.corner, points, window.guess, headings, shifts, window.penalty, CELL, least
+    )
+    if score < 0.0:
+        return Found(window.guess.copy(), -1.0)
     x, y = window.guess[:2] + best[1:] * CELL
     return Found(np.array([x, y, window.guess[2] + headings[best[0]]]), score)
 
@@ -146,9 +152,9 @@ def _least(d: int, size: int, last: int) -> float:
 @njit(cache=True)
 def _search(
     levels: np.ndarray, corner: np.ndarray, points: np.ndarray, guess: np.ndarray, headings: np.ndarray, shifts: int,
-    penalty: tuple[float, float], cell: float,
+    penalty: tuple[float, float], cell: float, least: float,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
-    """Best (index of the heading, shift in x, shift in y), and its score."""
+    """Best (index of the heading, shift in x, shift in y), and its score; -1: none is above `least`."""
     top = levels.shape[0] - 1
     block = 1 << top
     n, m = len(points), len(headings)
@@ -169,7 +175,7 @@ def _search(
                 cost = penalty[0] * off + penalty[1] * headings[t] ** 2
                 bounds[(t * side + a) * side + b] = _sum(levels[top], block, cells[t], di, dj) / n - cost
     order = np.argsort(-bounds, kind="mergesort")
-    best, best_value, best_score = np.zeros(3, np.int64), -math.inf, 0.0
+    best, best_value, best_score = np.zeros(3, np.int64), least, -1.0
     stack = np.empty((4 * top + 1, 3), np.int64)  # level, di, dj
     stack_bound = np.empty(4 * top + 1)
     for o in order:

@@ -16,7 +16,7 @@ RECENT = 12
 """A scan is held against so many key scans before it."""
 RETURNS = 240
 """So many returns of a scan are looked at in a search, evenly spread."""
-PENALTY = 0.02
+PENALTY = 0.05
 """What a pose costs that is off the guess by a standard deviation, in terms of the mean likelihood of the returns."""
 LEAST_SHARE = 0.3
 """A pose holds if so many of the points on lines have a counterpart ..."""

@@ -90,8 +90,8 @@ def close(surfaces: list[Surface], poses: np.ndarray, old: int, window: tuple[fl
     if not len(query.feet) or not len(known.feet):
         return None
     field = field_of(known.points)
-    found = search(field, thinned(query.points, RETURNS), Window(poses[new], *window))
-    if found.score < LEAST_SCORE:
+    found = search(field, thinned(query.points, RETURNS), Window(poses[new], *window), LEAST_SCORE)
+    if found.score < 0.0:
         return None
     weak = np.diag([1.0, 1.0, 10.0])  # the scans alone must tell
     fitted = align(query, target_of(known), found.pose, weak)

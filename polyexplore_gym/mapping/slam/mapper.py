@@ -27,7 +27,7 @@ Sources = Literal["odometry", "none"]
 
 STRIDE = 0.3, math.radians(15.0)
 """A scan is a key scan if it was taken so far from the last one, m, or turned against it so much, rad."""
-RAW = (0.06, 0.08, 0.05), (math.radians(2.0), 0.05, 0.15)
+RAW = (0.03, 0.05, 0.03), (math.radians(2.0), 0.05, 0.15)
 """Raw odometry errs by so much, by so much a metre and by so much a radian of turn: standard deviations in m, in rad."""
 FASTEST = (0.05, 0.45), (math.radians(2.0), math.radians(17.0))
 """Without odometry a robot goes, or turns, by this at least and at most from scan to scan (standard deviations), ..."""
