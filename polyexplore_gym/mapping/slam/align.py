@@ -86,7 +86,7 @@ def align(surface: Surface, target: Target, guess: np.ndarray, prior: np.ndarray
 @njit(cache=True)
 def _nearest(target: Target, x: float, y: float, nx: float, ny: float, reach: float) -> int:
     rows, columns = target.begin.shape[0], target.begin.shape[1] - 1
-    i, j = int(math.floor((y - target.corner[1]) / SIDE)), int(math.floor((x - target.corner[0]) / SIDE))
+    i, j = math.floor((y - target.corner[1]) / SIDE), math.floor((x - target.corner[0]) / SIDE)
     best, best_d2 = -1, reach * reach
     for a in range(max(i - 1, 0), min(i + 2, rows)):
         lo, hi = max(j - 1, 0), min(j + 2, columns)

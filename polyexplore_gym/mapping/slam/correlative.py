@@ -166,7 +166,7 @@ def _search(
         for k in range(n):
             x = guess[0] + c * points[k, 0] - s * points[k, 1] - corner[0]
             y = guess[1] + s * points[k, 0] + c * points[k, 1] - corner[1]
-            cells[t, k, 0], cells[t, k, 1] = int(math.floor(y / cell)), int(math.floor(x / cell))
+            cells[t, k, 0], cells[t, k, 1] = math.floor(y / cell), math.floor(x / cell)
         for a in range(side):
             di = a * block - shifts
             for b in range(side):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from scipy.sparse.linalg import SuperLU, splu
 
 from polyexplore_gym.mapping.logs.poses import between, compose
@@ -21,8 +22,6 @@ SETTLED = 1e-6
 """Relative decrease of the cost at which to stop."""
 DAMPING = 1e-8, 1e8
 """Damping to begin with, and with which to give up."""
-COLUMNS = 768
-"""So many columns of the inverse are held at a time."""
 
 
 class Edges(NamedTuple):
@@ -80,18 +79,18 @@ def covariances(poses: np.ndarray, edges: Edges) -> np.ndarray:
     Args:
         poses: (n, 3) of `solve`.
         edges: that they were solved with.
+
+    Of the inverse of the normal matrix only what the factor has entries for is worked out (Takahashi, Fagan and Chen,
+    "Formation of a sparse bus impedance matrix and its application to short circuit study", 1973).
     """
-    n = 3 * (len(poses) - 1)
     out = np.zeros((len(poses), 3, 3))
-    factor = _factor(_normal(poses, edges)[0]) if n else None
-    for begin in range(0, n, COLUMNS):
-        columns = np.arange(begin, min(begin + COLUMNS, n))
-        unit = np.zeros((n, columns.size))
-        unit[columns, columns - begin] = 1.0
-        assert factor is not None
-        block = factor.solve(unit)[columns].reshape(-1, 3, columns.size // 3, 3)
-        out[1 + columns[::3] // 3] = block[np.arange(len(block)), :, np.arange(len(block))]
-    return turned(0.5 * (out + out.transpose(0, 2, 1)), poses[:, 2])
+    if len(poses) > 1:
+        factor = _factor(_normal(poses, edges)[0])
+        lower = factor.L.tocsc()
+        lower.sort_indices()
+        inverse = _sparse_inverse(lower.indptr, lower.indices, lower.data, factor.U.diagonal())
+        out[1:] = _blocks(lower.indptr, lower.indices, inverse, factor.perm_c.reshape(-1, 3))
+    return turned(out, poses[:, 2])
 
 
 def local_covariances(poses: np.ndarray, edges: Edges) -> np.ndarray:
@@ -172,3 +171,38 @@ def _normal(poses: np.ndarray, edges: Edges) -> tuple[sp.csc_array, np.ndarray]:
 
 def _factor(h: sp.csc_array) -> SuperLU:
     return splu(h.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+@njit(cache=True)
+def _sparse_inverse(begin: np.ndarray, rows: np.ndarray, lower: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+    """Entries of the inverse of L D L' where L, of unit diagonal and in columns of increasing rows, has some."""
+    n = len(begin) - 1
+    out, place = np.zeros(len(lower)), np.full(n, -1, np.int64)
+    for j in range(n - 1, -1, -1):
+        for a in range(begin[j] + 1, begin[j + 1]):
+            place[rows[a]] = a
+        for a in range(begin[j] + 1, begin[j + 1]):
+            k = rows[a]
+            out[a] -= lower[a] * out[begin[k]]
+            for b in range(begin[k] + 1, begin[k + 1]):
+                at = place[rows[b]]
+                if at >= 0:
+                    out[at] -= lower[a] * out[b]
+                    out[a] -= lower[at] * out[b]
+        out[begin[j]] = 1.0 / diagonal[j]
+        for a in range(begin[j] + 1, begin[j + 1]):
+            out[begin[j]] -= lower[a] * out[a]
+            place[rows[a]] = -1
+    return out
+
+
+@njit(cache=True)
+def _blocks(begin: np.ndarray, rows: np.ndarray, values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) of a symmetric matrix, given by columns from the diagonal down, the rows and columns chosen (n, 3)."""
+    out = np.zeros((len(chosen), 3, 3))
+    for k in range(len(chosen)):
+        for a in range(3):
+            for b in range(3):
+                i, j = max(chosen[k, a], chosen[k, b]), min(chosen[k, a], chosen[k, b])
+                out[k, a, b] = values[begin[j] + np.searchsorted(rows[begin[j] : begin[j + 1]], i)]
+    return out

@@ -148,8 +148,8 @@ def _through(level: np.ndarray, corner: np.ndarray, pose: np.ndarray, points: np
         ux = (c * points[k, 0] - s * points[k, 1]) / far
         uy = (s * points[k, 0] + c * points[k, 1]) / far
         for n in range(int((far - _CLEAR) / cell)):
-            j = int(math.floor((pose[0] + ux * n * cell - corner[0]) / cell))
-            i = int(math.floor((pose[1] + uy * n * cell - corner[1]) / cell))
+            j = math.floor((pose[0] + ux * n * cell - corner[0]) / cell)
+            i = math.floor((pose[1] + uy * n * cell - corner[1]) / cell)
             if 0 <= i < rows and 0 <= j < columns and level[i, j] > _WALL:
                 passed += 1
                 break

@@ -13,7 +13,7 @@ import numpy as np
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.errors import InvalidConfigError
 from polyexplore_gym.mapping.logs.deskew import deskewed
-from polyexplore_gym.mapping.logs.poses import between, compose, wrap
+from polyexplore_gym.mapping.logs.poses import between, compose
 from polyexplore_gym.mapping.logs.record import LaserLog, Track, Way
 from polyexplore_gym.mapping.slam import loops
 from polyexplore_gym.mapping.slam.front import RECENT, Guess, match
@@ -265,12 +265,13 @@ def _odometry_edges(way: Way, keys: np.ndarray, calibration: Calibration, error:
 def _along(log: LaserLog, way: Way | None, calibration: Calibration | None, poses: np.ndarray) -> Track:
     """All that is known of the way, by time."""
     if way is None or calibration is None:
-        stamps, rows = log.times, poses
+        stamps, rows, scans = log.times, poses, np.arange(len(log))
     else:
-        stamps, rows = way.stamps, filled(calibrated(way.poses, calibration), way.scans, poses)
+        stamps, rows, scans = way.stamps, filled(calibrated(way.poses, calibration), way.scans, poses), way.scans
     if stamps is None or not np.isfinite(stamps).any():
         return Track(np.zeros(0), np.zeros((0, 3)))
     timed = np.isfinite(stamps)
-    rows = rows[timed]
-    rows[:, 2] = wrap(rows[:, 2])
-    return Track.sorted(spread(stamps[timed]), rows)
+    fixed = np.cumsum(timed)[scans[timed[scans]]] - 1
+    times, rows = spread(stamps[timed], fixed), rows[timed]
+    first = np.concatenate([fixed, np.delete(np.arange(len(times)), fixed)])  # at one time a scan goes before others
+    return Track.sorted(times[first], rows[first])

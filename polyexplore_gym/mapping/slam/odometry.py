@@ -10,21 +10,24 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 from scipy.optimize import least_squares
 
 from polyexplore_gym.errors import InvalidLogError
-from polyexplore_gym.mapping.logs.poses import between, compose, wrap
+from polyexplore_gym.mapping.logs.poses import between, wrap
 from polyexplore_gym.mapping.logs.record import LaserLog, Way
 
-STAMP = 0.01
-"""Equal stamps in a row stand for times within so much of each other, s."""
+STAMP = 1e-4, 0.01
+"""Stamps are rounded to so much at least, and at most, s: equal ones in a row stand for times within that."""
+AROUND = 200
+"""What stamps are rounded to is told by so many around."""
 LEAST_STEPS = 30
 """Fewest steps to calibrate with."""
 LEAST_WAY = 10.0, 2.0 * np.pi
 """They lead so far altogether, and turn so much, m and rad."""
 USUAL = 0.03, 0.02
 """Errors that count as the rule, not as outliers, m and rad."""
-ALONG = 0.2
+ALONG = 0.05
 """An error of the odometry grows by a metre of way as by so many rad of turn."""
 
 
@@ -115,37 +118,56 @@ def calibrate(way: Way, scans: np.ndarray, poses: np.ndarray) -> tuple[Calibrati
 def filled(odometry: np.ndarray, at: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """(m, 3) poses all along a way, of which some are known.
 
-    Between two known poses the odometry leads from one to the other; what it misses by is spread over the way as it
-    goes and turns. Before the first and behind the last it leads on.
+    Between two known poses the odometry leads from one to the other: first its headings, what they miss by spread over
+    the turns, then with these its steps, what they miss by spread over their lengths. Before the first known pose and
+    behind the last the odometry leads on.
 
     Args:
         odometry: (m, 3) the way by odometry.
         at: (k,) where on it poses are known; increasing.
         poses: (k, 3) these.
     """
-    m = len(odometry)
-    before = np.clip(np.searchsorted(at, np.arange(m), side="right") - 1, 0, len(at) - 1)
-    after = np.minimum(before + 1, len(at) - 1)
     step = between(odometry[:-1], odometry[1:])
-    grown = np.concatenate([[0.0], np.cumsum(np.abs(step[:, 2]) + ALONG * np.hypot(step[:, 0], step[:, 1]))])
+    length = np.hypot(step[:, 0], step[:, 1])
+    heading = _through(_sums(step[:, 2]), _sums(np.abs(step[:, 2]) + ALONG * length), at, np.unwrap(poses[:, 2]))
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    gone = _sums(length)
+    x = _through(_sums(c * step[:, 0] - s * step[:, 1]), gone, at, poses[:, 0])
+    y = _through(_sums(s * step[:, 0] + c * step[:, 1]), gone, at, poses[:, 1])
+    return np.stack([x, y, wrap(heading)], axis=1)
+
+
+def _through(values: np.ndarray, grown: np.ndarray, at: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(m,) values moved to go through known ones (k,) at (k,); between, what is missing grows with `grown` (m,)."""
+    before = np.clip(np.searchsorted(at, np.arange(len(values)), side="right") - 1, 0, len(at) - 1)
+    after = np.minimum(before + 1, len(at) - 1)
     begin, end = grown[at[before]], grown[at[after]]
-    share = np.clip((grown - begin) / np.where(end > begin, end - begin, 1.0), 0.0, 1.0)[:, None]
-    a = compose(poses[before], between(odometry[at[before]], odometry))
-    b = compose(poses[after], between(odometry[at[after]], odometry))
-    last = np.arange(m)[:, None] >= at[-1]
-    out = np.where(last, a, a + share * (b - a))
-    out[:, 2] = np.where(last[:, 0], a[:, 2], a[:, 2] + share[:, 0] * wrap(b[:, 2] - a[:, 2]))
-    first = np.arange(m) < at[0]
-    out[first] = compose(poses[0], between(odometry[at[0]], odometry[first]))
-    out[:, 2] = wrap(out[:, 2])
-    out[at] = poses
-    return out
+    share = np.clip((grown - begin) / np.where(end > begin, end - begin, 1.0), 0.0, 1.0)
+    missing = known - values[at]
+    return values + missing[before] + share * (missing[after] - missing[before])
 
 
-def spread(stamps: np.ndarray) -> np.ndarray:
-    """(m,) stamps; of equal ones in a row each gets its own time, evenly within what they were rounded to."""
+def _sums(steps: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def spread(stamps: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """(m,) stamps; of equal ones in a row each gets its own time, evenly within what they were rounded to.
+
+    Args:
+        stamps: (m,) s, as written: rounded, more coarsely perhaps as a log goes on.
+        fixed: (f,) those that keep theirs, increasing.
+    """
     first = np.flatnonzero(np.concatenate([[True], np.diff(stamps) != 0.0]))
     count = np.diff(np.append(first, len(stamps)))
-    rank = np.arange(len(stamps)) - np.repeat(first, count)
-    many = np.repeat(count, count)
-    return np.where(many > 1, stamps + STAMP * ((rank + 0.5) / many - 0.5), stamps)
+    which = np.repeat(np.arange(len(first)), count)
+    gaps = np.abs(np.diff(stamps[first]))
+    # what they were rounded to: the least step around
+    rounded = minimum_filter1d(np.append(gaps, np.inf), AROUND, mode="nearest")[which]
+    rounded = np.clip(np.where(np.isfinite(rounded), rounded, 0.0), *STAMP)
+    rank = (np.arange(len(stamps)) - first[which] + 0.5) / count[which] - 0.5
+    kept = np.full(len(first), np.nan)
+    kept[which[fixed][::-1]] = rank[fixed][::-1]  # the first of a row
+    around = np.nan_to_num(kept)[which]
+    room = np.where(rank < around, 0.5 + around, 0.5 - around)  # to that end of what they were rounded to
+    return stamps + rounded * np.where(count[which] > 1, 0.5 * (rank - around) / room, 0.0)
