@@ -97,7 +97,7 @@ def _levels(
     points: np.ndarray, corner: np.ndarray, rows: int, columns: int, cell: float, blur: float, count: int
 ) -> np.ndarray:
     out = np.zeros((count, rows, columns), np.float32)
-    reach = int(math.ceil(3.0 * blur / cell))
+    reach = math.ceil(3.0 * blur / cell)
     for k in range(len(points)):
         j, i = int((points[k, 0] - corner[0]) / cell), int((points[k, 1] - corner[1]) / cell)
         for a in range(max(i - reach, 0), min(i + reach + 1, rows)):

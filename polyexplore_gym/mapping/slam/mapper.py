@@ -28,7 +28,7 @@ Sources = Literal["odometry", "none"]
 STRIDE = 0.3, math.radians(15.0)
 """A scan is a key scan if it was taken so far from the last one, m, or turned against it so much, rad."""
 RAW = (0.03, 0.05, 0.03), (math.radians(2.0), 0.05, 0.15)
-"""Raw odometry errs by so much, by so much a metre and by so much a radian of turn: standard deviations in m, in rad."""
+"""Raw odometry errs by so much, by so much a metre and by so much a radian of turn: standard deviations, m and rad."""
 FASTEST = (0.05, 0.45), (math.radians(2.0), math.radians(17.0))
 """Without odometry a robot goes, or turns, by this at least and at most from scan to scan (standard deviations), ..."""
 SPEED = 0.5, math.radians(30.0)
@@ -236,13 +236,14 @@ def _solved(
             held = _odometry_edges(way, keys, calibration, error)
         else:
             held = Edges.of([(k - 1, k, known.steps[k], _weak(known.steps[k]), True) for k in range(1, len(keys))])
+        # what is wrong with a scan is wrong in all of its pairs: together they count as two
+        shared = max(len(aligned.ends) / len(keys), 1.0)
+        aligned = aligned._replace(information=aligned.information / shared)
         edges = Edges(*(np.concatenate(both) for both in zip(aligned, held, strict=True)))
         poses = solve(poses, edges)
-    # the errors of a scan are in all of its pairs: they do not add up to more than it knows
-    share = max(0.5 * len(edges.ends) / max(len(keys), 1), 1.0)
     at = np.maximum(np.searchsorted(keys, np.arange(len(log)), side="right") - 1, 0)
     everywhere = filled(np.array(known.poses), keys, poses)
-    absolute, local = share * covariances(poses, edges)[at], share * local_covariances(poses, edges)[at]
+    absolute, local = covariances(poses, edges)[at], local_covariances(poses, edges)[at]
     return Corrected(
         poses=everywhere,
         covariance=absolute,

@@ -107,7 +107,7 @@ def calibrate(way: Way, scans: np.ndarray, poses: np.ndarray) -> tuple[Calibrati
     long_enough = np.hypot(told[:, 0], told[:, 1]).sum() > LEAST_WAY[0] and np.abs(told[:, 2]).sum() > LEAST_WAY[1]
     if len(told) >= LEAST_STEPS and long_enough:
         scale = np.array([USUAL[0], USUAL[0], USUAL[1]])
-        begin = values + [0.01, 0.01, 0.0, 0.0, 0.01]  # off zero, for the differences
+        begin = values + np.array([0.01, 0.01, 0.0, 0.0, 0.01])  # off zero, for the differences
         values = least_squares(lambda v: (off(v) / scale).ravel(), begin, loss="soft_l1").x
     left = np.abs(off(values)) / 0.6745  # median absolute deviation of a Gaussian
     xy = float(np.hypot(*np.median(left[:, :2], axis=0)) / np.sqrt(2.0)) if len(left) else 0.0

@@ -21,7 +21,7 @@ LEAST_MATCHED = 20
 LEAST_SHARE = 0.25
 """... of all that one of them sees."""
 HOLD = 0.05, 0.02
-"""Standard deviation with which the poses at hand hold what the lines of a pair do not, while it is aligned, m and rad."""
+"""Standard deviations with which the poses at hand hold what the lines of a pair do not, m and rad."""
 
 
 def pairs(poses: np.ndarray) -> np.ndarray:
