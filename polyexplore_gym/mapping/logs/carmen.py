@@ -343,7 +343,8 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
     if told:
         fixed = _constant(between(robot, laser))
         if fixed is None:
-            odometry, track, way = compose(robot, mount), None, None
+            odometry, track = compose(robot, mount), None
+            way: Way | None = None
             if len(odom) and _follow(robot, odom, scans, times):
                 track, way = _track(odom, mount), _way(odom, mount, scans, odometry)
             why = f"x y theta differ from {of_robot}"

@@ -77,8 +77,9 @@ class LaserLog:
     """(n, 3, 3) covariance of the poses, m2, m rad, rad2, if the log gives it."""
     max_range: float | None = None
     """Range from which on a beam has no return, m, if the log gives it."""
-    poses_are: Literal["corrected", "odometry", "unknown"] = "unknown"
-    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; or the log does not say."""
+    poses_are: Literal["corrected", "odometry", "unknown", "matched"] = "unknown"
+    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; the log does not say; or
+    matched: found from the scans by `correct_poses`."""
     why: str = ""
     """How that is known, for the user: a clause."""
     odometry: np.ndarray | None = None

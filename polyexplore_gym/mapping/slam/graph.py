@@ -107,7 +107,7 @@ def local_covariances(poses: np.ndarray, edges: Edges) -> np.ndarray:
     own = np.zeros((len(poses), 3, 3))
     np.add.at(own, i, first.transpose(0, 2, 1) @ weighted @ first)
     np.add.at(own, j, second.transpose(0, 2, 1) @ weighted @ second)
-    return turned(np.linalg.inv(own), poses[:, 2])
+    return turned(np.linalg.inv(own), poses[:, 2]) if len(edges.ends) else own
 
 
 def turned(covariance: np.ndarray, heading: np.ndarray) -> np.ndarray:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,6 +26,8 @@ from polyexplore_gym.mapping.slam.state import State, fingerprint, load, save
 from polyexplore_gym.mapping.slam.surface import Surface, surface_of
 
 Sources = Literal["odometry", "none"]
+Tracker = Callable[[Iterable[int], str], Iterable[int]]
+"""Wraps the scans of a pass, to show progress; the second argument names the pass."""
 
 STRIDE = 0.3, math.radians(15.0)
 """A scan is a key scan if it was taken so far from the last one, m, or turned against it so much, rad."""
@@ -71,7 +75,7 @@ def correct_poses(
     *,
     source: Sources = "odometry",
     state: Path | None = None,
-    track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
+    track: Tracker = lambda scans, what: scans,
 ) -> Corrected:
     """The poses of a log's scans, from the scans and, if there is any, odometry.
 
@@ -86,7 +90,7 @@ def correct_poses(
         source: "odometry": that of the log says where to look; "none": the scans alone do.
         state: file to go on from and to write to as the scans are matched, so that an interrupted run loses nothing;
             of no use to another log.
-        track: wraps the scans of each pass, to show progress; its second argument names the pass.
+        track: shows progress.
 
     Raises:
         InvalidConfigError: the source has another name.
@@ -101,9 +105,23 @@ def correct_poses(
     return _solved(log, way, known, surfaces, track)
 
 
+def corrected_log(log: LaserLog, corrected: Corrected) -> LaserLog:
+    """The log with corrected poses, for `map_log`.
+
+    Their covariances are those against the scans around: what all walls of a place share is left out, as a line map
+    takes the errors of two poses for independent.
+    """
+    return replace(
+        log,
+        poses=corrected.poses,
+        pose_covariance=corrected.local_covariance,
+        poses_are="matched",
+        why=f"scans matched, {corrected.loops} places seen again, {corrected.lost} scans not recognised",
+    )
+
+
 def _track(
-    log: LaserLog, way: Way | None, sensor: SensorConfig, config: MappingConfig, path: Path | None,
-    track: Callable[[Iterable[int], str], Iterable[int]],
+    log: LaserLog, way: Way | None, sensor: SensorConfig, config: MappingConfig, path: Path | None, track: Tracker
 ) -> tuple[State, list[Surface]]:  # fmt: skip
     """All scans, one after the other, and the surfaces of the key scans."""
     mark = fingerprint(log, f"{sensor} {config} {way is None}") if path is not None else ""
@@ -220,17 +238,14 @@ def _move(known: State, keys: np.ndarray) -> None:
     known.poses = list(moved)
 
 
-def _solved(
-    log: LaserLog, way: Way | None, known: State, surfaces: list[Surface],
-    track: Callable[[Iterable[int], str], Iterable[int]],
-) -> Corrected:  # fmt: skip
+def _solved(log: LaserLog, way: Way | None, known: State, surfaces: list[Surface], track: Tracker) -> Corrected:
     """All poses together."""
     keys, poses = np.array(known.keys), np.array([known.poses[k] for k in known.keys])
     calibration = None
     edges = _edges(known)
     for n in range(ROUNDS if len(keys) > 1 else 0):
         ends = pairs(poses)
-        aligned = pair_edges(surfaces, poses, ends, lambda scans, what, n=n: track(scans, f"{what} {n + 1}"))
+        aligned = pair_edges(surfaces, poses, ends, partial(_numbered, track, n + 1))
         if way is not None:
             calibration, error = calibrate(way, keys, poses)
             held = _odometry_edges(way, keys, calibration, error)
@@ -254,6 +269,10 @@ def _solved(
         lost=known.lost,
         calibration=calibration,
     )
+
+
+def _numbered(track: Tracker, number: int, scans: Iterable[int], what: str) -> Iterable[int]:
+    return track(scans, f"{what} {number}")
 
 
 def _odometry_edges(way: Way, keys: np.ndarray, calibration: Calibration, error: Error) -> Edges:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from polyexplore_gym.errors import ResultsError
 from polyexplore_gym.mapping.logs.record import LaserLog
 from polyexplore_gym.mapping.slam.loops import Loop
 
@@ -54,11 +53,15 @@ def fingerprint(log: LaserLog, settings: str) -> str:
 
 
 def save(state: State, path: Path, log: str) -> None:
-    """Write a state in one go; `log` is of `fingerprint`."""
+    """Write a state in one go; `log` is of `fingerprint`.
+
+    Raises:
+        ResultsError: the file cannot be written.
+    """
     loops = [*state.loops, *state.pending]
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    part = path.with_name(f".{path.name}.part")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("wb") as file:
             np.savez(
                 file,
                 log=np.array(log),
@@ -72,11 +75,11 @@ def save(state: State, path: Path, log: str) -> None:
                 loop_information=np.array([loop.information for loop in loops]).reshape(-1, 3, 3),
                 numbers=np.array([len(state.loops), state.closed, state.lost, state.since]),
             )
-        os.replace(name, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(name)
-        raise
+        os.replace(part, path)
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def load(path: Path, log: str) -> State | None:
