@@ -343,12 +343,12 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
     if told:
         fixed = _constant(between(robot, laser))
         if fixed is None:
-            odometry, track = compose(robot, mount), None
-            way: Way | None = None
-            if len(odom) and _follow(robot, odom, scans, times):
-                track, way = _track(odom, mount), _way(odom, mount, scans, odometry)
+            odometry = compose(robot, mount)
+            followed = bool(len(odom)) and _follow(robot, odom, scans, times)
+            track = _track(odom, mount) if followed else None
+            between_scans = _way(odom, mount, scans, odometry) if followed else None
             why = f"x y theta differ from {of_robot}"
-            return _Poses(laser, "corrected", why, odometry, track, way, times, mount)
+            return _Poses(laser, "corrected", why, odometry, track, between_scans, times, mount)
         mount = fixed
     else:
         robot = compose(laser, between(mount, np.zeros(3)))

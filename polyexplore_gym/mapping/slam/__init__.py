@@ -2,8 +2,8 @@
 
 Scan by scan: `surface` (returns and the lines they lie on), `correlative` (where in a window does a scan fit), `align`
 (points to lines, from near by), `front` (these two against the scans before), `loops` (places seen again), `graph` (all
-poses together); `odometry` (what is wrong with it), `refine` (pairs of scans), `state` (the file from which a run that was
-stopped goes on), `mapper` (the whole).
+poses together); `odometry` (what is wrong with it), `refine` (pairs of scans), `state` (the file to go on from), `mapper`
+(the whole).
 """
 
 from polyexplore_gym.mapping.slam.mapper import Corrected, correct_poses, corrected_log
