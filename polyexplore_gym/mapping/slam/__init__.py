@@ -2,7 +2,7 @@
 
 Scan by scan: `surface` (returns and the lines they lie on), `correlative` (where in a window does a scan fit), `align`
 (points to lines, from near by), `front` (these two against the scans before), `loops` (places seen again), `graph` (all
-poses together); `odometry` (what is wrong with it), `refine` (pairs of scans), `state` (the file to go on from), `mapper`
+poses together); `odometry` (what is wrong with it), `refine` (pairs of scans), `state` (a file to go on from), `mapper`
 (the whole).
 """
 

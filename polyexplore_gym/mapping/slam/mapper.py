@@ -56,8 +56,8 @@ class Corrected(NamedTuple):
     """(n, 3, 3) given the first pose: m2, m rad, rad2."""
     local_covariance: np.ndarray
     """(n, 3, 3) given the scans around: how well a scan fits the walls that it sees."""
-    track: Track
-    """All that is known of the way, by time: the scans and the odometry between them; none without times."""
+    way: Way
+    """The same and, of a log with odometry between its scans, the poses there, in the order of the log."""
     keys: np.ndarray
     """(k,) the key scans."""
     loops: int
@@ -66,6 +66,15 @@ class Corrected(NamedTuple):
     """Scans that were not recognised in those before them."""
     calibration: Calibration | None
     """What was wrong with the odometry."""
+
+    @property
+    def track(self) -> Track:
+        """`way` by time, without what has none."""
+        timed = np.isfinite(self.way.stamps)
+        at = np.cumsum(timed)[self.way.scans[timed[self.way.scans]]] - 1
+        times, poses = spread(self.way.stamps[timed], at), self.way.poses[timed]
+        first = np.concatenate([at, np.delete(np.arange(len(times)), at)])  # at one time a scan goes before others
+        return Track.sorted(times[first], poses[first])
 
 
 def correct_poses(
@@ -263,7 +272,7 @@ def _solved(log: LaserLog, way: Way | None, known: State, surfaces: list[Surface
         poses=everywhere,
         covariance=absolute,
         local_covariance=local,
-        track=_along(log, way, calibration, everywhere),
+        way=_along(log, way, calibration, everywhere),
         keys=keys,
         loops=len(known.loops),
         lost=known.lost,
@@ -282,16 +291,9 @@ def _odometry_edges(way: Way, keys: np.ndarray, calibration: Calibration, error:
     return Edges.of([(k - 1, k, step[k - 1], information, True) for k in range(1, len(keys))])
 
 
-def _along(log: LaserLog, way: Way | None, calibration: Calibration | None, poses: np.ndarray) -> Track:
-    """All that is known of the way, by time."""
+def _along(log: LaserLog, way: Way | None, calibration: Calibration | None, poses: np.ndarray) -> Way:
+    """The scans, and the odometry between them made to fit."""
     if way is None or calibration is None:
-        stamps, rows, scans = log.times, poses, np.arange(len(log))
-    else:
-        stamps, rows, scans = way.stamps, filled(calibrated(way.poses, calibration), way.scans, poses), way.scans
-    if stamps is None or not np.isfinite(stamps).any():
-        return Track(np.zeros(0), np.zeros((0, 3)))
-    timed = np.isfinite(stamps)
-    fixed = np.cumsum(timed)[scans[timed[scans]]] - 1
-    times, rows = spread(stamps[timed], fixed), rows[timed]
-    first = np.concatenate([fixed, np.delete(np.arange(len(times)), fixed)])  # at one time a scan goes before others
-    return Track.sorted(times[first], rows[first])
+        stamps = np.full(len(log), np.nan) if log.times is None else log.times
+        return Way(stamps, poses, np.arange(len(log)))
+    return way._replace(poses=filled(calibrated(way.poses, calibration), way.scans, poses))
