@@ -49,7 +49,10 @@ def scores(field, points, window):
     rows, columns = field.levels[0].shape
     out = np.empty((len(headings), 2 * shifts + 1, 2 * shifts + 1))
     for t, heading in enumerate(headings):
-        at = compose(window.guess + [0, 0, heading], np.c_[points, np.zeros(len(points))])[:, :2] - field.corner
+        at = (
+            compose(window.guess + np.array([0, 0, heading]), np.c_[points, np.zeros(len(points))])[:, :2]
+            - field.corner
+        )
         cells = np.floor(at / CELL).astype(int)
         for a in range(-shifts, shifts + 1):
             for b in range(-shifts, shifts + 1):
@@ -87,7 +90,7 @@ def test_the_search_finds_the_best_of_all_poses(seed, penalty):
 
 def test_the_search_recognises_a_place_from_far_off():
     true = np.array([4.0, 1.5, 2.0])
-    guess, pose = true + [0.9, -0.8, math.radians(50)], np.array([3.5, 2.0, 2.2])
+    guess, pose = true + np.array([0.9, -0.8, math.radians(50)]), np.array([3.5, 2.0, 2.2])
     found = search(field_of(placed(seen(pose), pose).points), seen(true, step=2).points, Window(guess, 1.5, 1.2))
     assert np.hypot(*(found.pose - true)[:2]) < 0.1
     assert abs(found.pose[2] - true[2]) < math.radians(1.5)
