@@ -85,7 +85,7 @@ def close(surfaces: list[Surface], poses: np.ndarray, old: int, window: tuple[fl
     """
     new = len(poses) - 1
     lately = slice(max(new + 1 - LAST, 0), new + 1)
-    then = slice(max(old - AROUND, 0), old + AROUND + 1)
+    then = slice(max(old - AROUND, 0), min(old + AROUND + 1, lately.start))
     query, known = merged(surfaces[lately], poses[lately], poses[new]), merged(surfaces[then], poses[then])
     if not len(query.feet) or not len(known.feet):
         return None
