@@ -70,9 +70,15 @@ class Corrected(NamedTuple):
     @property
     def track(self) -> Track:
         """`way` by time, without what has none."""
-        timed = np.isfinite(self.way.stamps)
-        at = np.cumsum(timed)[self.way.scans[timed[self.way.scans]]] - 1
-        times, poses = spread(self.way.stamps[timed], at), self.way.poses[timed]
+        stamps, poses = self.way.stamps, self.way.poses
+        scan = np.zeros(len(stamps), bool)
+        scan[self.way.scans] = True
+        kept = np.isfinite(stamps)
+        # an ODOM line of the very scan that follows it
+        moved = (np.diff(stamps) != 0.0) | (np.abs(np.diff(poses, axis=0)) > 1e-9).any(axis=1)
+        kept[:-1] &= scan[:-1] | ~scan[1:] | moved
+        at = np.flatnonzero(scan[kept])
+        times, poses = spread(stamps[kept], at), poses[kept]
         first = np.concatenate([at, np.delete(np.arange(len(times)), at)])  # at one time a scan goes before others
         return Track.sorted(times[first], poses[first])
 
