@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -43,6 +44,8 @@ BENT = 0.1, math.radians(1.0)
 """The map is bent by the first loop that is off by more, m and rad."""
 ROUNDS = 3
 """Times that all pairs of scans are aligned and all poses solved."""
+MOST_LOST = 0.05
+"""If a larger share of the scans is not recognised, a warning says so."""
 SAVE_EVERY = 10.0
 """Seconds between two writings of the state."""
 
@@ -96,7 +99,7 @@ def correct_poses(
 
     Each scan is searched for in the last ones before it and aligned with their lines; places seen again bend the map
     back; then what is wrong with the odometry is told, and all scans that see the same walls are aligned in pairs and
-    solved for together, some rounds.
+    solved for together, some rounds. A UserWarning says so if many scans were not recognised.
 
     Args:
         log: of `read_log`.
@@ -117,6 +120,11 @@ def correct_poses(
     log = deskewed(log)
     way = way_of(log) if source == "odometry" else None
     known, surfaces = _track(log, way, sensor, config, state, track)
+    if known.lost > MOST_LOST * len(log):
+        warnings.warn(
+            f"{known.lost} of {len(log)} scans show too little of what those before them show: poses there are guesses",
+            stacklevel=2,
+        )
     return _solved(log, way, known, surfaces, track)
 
 
