@@ -46,7 +46,8 @@ class State:
 def fingerprint(log: LaserLog, settings: str) -> str:
     """Tells logs and settings apart."""
     digest = hashlib.sha256(f"{FORMAT} {settings}".encode())
-    for arrays in (log.angles, log.ranges, [] if log.way is None else [log.way.poses], [log.odometry, log.poses]):
+    way = None if log.way is None else log.way.poses
+    for arrays in (log.angles, log.ranges, [way, log.odometry, log.poses, log.times]):
         for array in arrays:
             digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
