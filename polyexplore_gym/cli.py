@@ -18,13 +18,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from polyexplore_gym.config import EnvConfig, PlanFileConfig, from_mapping, to_mapping
-from polyexplore_gym.errors import InvalidConfigError, InvalidFloorPlanError, MissingDependencyError, PolyExploreError
+from polyexplore_gym.errors import (
+    InvalidConfigError,
+    InvalidFloorPlanError,
+    InvalidLogError,
+    MissingDependencyError,
+    PolyExploreError,
+)
 from polyexplore_gym.presets import PresetName
 
 if TYPE_CHECKING:
+    from polyexplore_gym.config import MappingConfig, SensorConfig
     from polyexplore_gym.evaluation import EpisodeRecord, PolicySpec, Study, Summary
     from polyexplore_gym.floorplan import FloorPlan
-    from polyexplore_gym.mapping import LaserLog, LogMap
+    from polyexplore_gym.mapping import LaserLog, LogMap, Track
     from polyexplore_gym.snapshot import Snapshot
 
 BENCH_PLANS = {"home-test": 16, "angled-test": 4, "office-test": 2}
@@ -241,12 +248,17 @@ class Linemap:
     """Topic of the scans in a bag (default: the one with the most scans)."""
     trajectory_in: Path | None = None
     """File of poses of the laser, in the TUM format, to be used instead of those in the log."""
+    poses: Literal["log", "odometry", "none"] = "log"
+    """Poses of the scans: those of the log; or found from the scans, with its raw odometry as a hint, or with none. A
+    run that was stopped goes on where it was."""
+    trajectory: Path | None = None
+    """File to write the poses of the laser to, in the TUM format; with --poses odometry those between scans too."""
     field_of_view: float | None = None
     """FLASER only: angle between the first and the last beam, degrees (default: 180, less a step if beams are even)."""
     sigma_xy: float = 0.02
-    """Standard deviation of the poses' x and y, m, unless the log gives covariances."""
+    """Standard deviation of the poses' x and y, m, unless the log or --poses gives covariances."""
     sigma_heading: float = 0.3
-    """Standard deviation of the poses' heading, degrees, unless the log gives covariances."""
+    """Standard deviation of the poses' heading, degrees, unless the log or --poses gives covariances."""
     every: int = 1
     """Use only every so many-th scan."""
     min_travel: float = 0.0
@@ -430,8 +442,10 @@ def linemap(options: Linemap) -> int:
     from tqdm import tqdm
 
     from polyexplore_gym.config import MappingConfig
-    from polyexplore_gym.mapping import map_log, read_log, save_map, sensor_of
+    from polyexplore_gym.mapping import map_log, read_log, save_map, save_trajectory, sensor_of
 
+    if options.trajectory is not None and not options.trajectory.parent.is_dir():
+        raise InvalidConfigError(f"{options.trajectory}: the folder {options.trajectory.parent} does not exist")
     files = _map_files(options)
     fov = options.field_of_view
     if fov is not None and not 0 < fov <= 360:
@@ -451,6 +465,8 @@ def linemap(options: Linemap) -> int:
             field_of_view=None if fov is None else math.radians(fov),
             watch=lambda done: bar.update(done - bar.n),
         )
+    if options.trajectory is not None and log.times is None:
+        raise InvalidLogError(f"{options.log}: the scans have no times: --trajectory cannot be written")
     for path in files:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -465,6 +481,12 @@ def linemap(options: Linemap) -> int:
     for note in log.notes:
         _say(f"note: {note}")
     sensor = sensor_of(log, options.max_range, options.sigma_range, math.radians(options.sigma_angle))
+
+    def track(scans: Iterable[int], what: str) -> Iterable[int]:
+        return tqdm(scans, desc=what, unit="scan", dynamic_ncols=True)
+
+    state = files[0].parent / f"{_stem(options.log)}.slam.npz"
+    log, poses = _posed(options, log, sensor, config, state, track)
     result = map_log(
         log,
         sensor,
@@ -474,7 +496,7 @@ def linemap(options: Linemap) -> int:
         every=options.every,
         min_travel=options.min_travel,
         ratio=options.ratio,
-        track=lambda scans, what: tqdm(scans, desc=what, unit="scan", dynamic_ncols=True),
+        track=track,
     )
     print(_linemap_text(options.log.name, log, result))
     for path in files:
@@ -484,7 +506,28 @@ def linemap(options: Linemap) -> int:
             _say(f"no {path.name}: {error}")
         else:
             print(f"written: {path}")
+    if options.trajectory is not None and poses is not None:
+        save_trajectory(poses, options.trajectory)
+        print(f"written: {options.trajectory}")
+    state.unlink(missing_ok=True)
     return 0
+
+
+def _posed(
+    options: Linemap, log: LaserLog, sensor: SensorConfig, config: MappingConfig, state: Path, track: Any
+) -> tuple[LaserLog, Track | None]:
+    """The log with the poses asked for, and these by time."""
+    from polyexplore_gym.mapping import Track, correct_poses, corrected_log
+
+    if options.poses == "log":
+        timed = log.times is not None and log.poses is not None
+        return log, Track.sorted(log.times, log.poses) if timed else None  # type: ignore[arg-type]
+    try:
+        found = correct_poses(log, sensor, config, source=options.poses, state=state, track=track)
+    except KeyboardInterrupt:
+        _say(f"\nstopped; what is matched is in {state}: the same command goes on from there")
+        raise
+    return corrected_log(log, found), found.track
 
 
 _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {

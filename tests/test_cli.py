@@ -364,6 +364,97 @@ def test_a_bag_becomes_a_map(tmp_path, capsys):
     assert not (tmp_path / "b.json").exists()
 
 
+@pytest.fixture(scope="module")
+def raw_log(tmp_path_factory) -> tuple[Path, np.ndarray]:
+    """A CARMEN log of a drive round a block with raw odometry, and the true poses."""
+    sys.path.insert(0, str(Path(__file__).parent / "mapping"))
+    from slam_scenes import drive
+
+    log, true = drive(np.random.default_rng(0), count=1)
+    lines = []
+    for ranges, pose, time in zip(log.ranges, log.poses, log.times, strict=True):
+        x, y, heading = (f"{value:.6f}" for value in pose)
+        lines.append(f"ODOM {x} {y} {heading} 0 0 0 {time:.6f} host {time:.6f}")
+        readings = " ".join(f"{min(r, 81.83):.3f}" for r in ranges)
+        lines.append(f"FLASER {ranges.size} {readings} {x} {y} {heading} {x} {y} {heading} {time:.6f} host {time:.6f}")
+    path = tmp_path_factory.mktemp("raw") / "round.log"
+    path.write_text("\n".join(lines) + "\n")
+    return path, true
+
+
+def test_raw_odometry_is_corrected(raw_log, tmp_path, capsys):
+    from polyexplore_gym.mapping.logs import read_trajectory
+    from polyexplore_gym.mapping.logs.poses import between
+
+    log, true = raw_log
+    a, b, c = (tmp_path / name for name in ("a.json", "b.json", "c.json"))
+    assert main(["linemap", str(log), "--max-range", "12", "--out", str(a)]) == 0
+    told = capsys.readouterr().err
+    assert "warning: walls that were seen again do not fit" in told
+    assert "--poses odometry finds better ones" in told
+    poses = tmp_path / "poses.txt"
+    corrected = ["linemap", str(log), "--max-range", "12", "--poses", "odometry", "--trajectory", str(poses)]
+    assert main([*corrected, "--out", str(b)]) == 0
+    captured = capsys.readouterr()
+    assert "warning" not in captured.err
+    assert "poses         matched: scans matched, " in captured.out
+    assert f"written: {poses}" in captured.out
+    for step in ("match", "pairs 1", "pairs 3", "lines"):  # progress
+        assert f"{step}: 100%" in captured.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "b.json", "poses.txt"]
+    track = read_trajectory(poses)
+    assert len(track.times) == len(true)
+    off = between(between(true[0], true), between(track.poses[0], track.poses))
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05
+    # the trajectory beside the log gives that map again, with covariances of its own
+    again = ["linemap", str(log), "--max-range", "12", "--trajectory-in", str(poses), "--out", str(c)]
+    assert main([*again, "--sigma-xy", "0.005", "--sigma-heading", "0.1"]) == 0
+    assert "warning" not in capsys.readouterr().err
+    maps = [json.loads(path.read_text()) for path in (a, b, c)]
+    assert len(maps[0]["lines"]) > 1.3 * len(maps[1]["lines"])
+    assert abs(len(maps[1]["lines"]) - len(maps[2]["lines"])) <= 5
+    assert maps[1]["median_distance"] < 0.012
+
+
+def test_a_stopped_correction_goes_on(raw_log, tmp_path, capsys, monkeypatch):
+    import polyexplore_gym.mapping.slam.mapper as mapper
+
+    log, true = raw_log
+    call = ["linemap", str(log), "--max-range", "12", "--poses", "odometry", "--out", str(tmp_path / "a.json")]
+    insert, work = mapper._insert, []
+
+    def stopping(*args):
+        work.append(1)
+        if len(work) == 30:
+            raise KeyboardInterrupt
+        insert(*args)
+
+    monkeypatch.setattr(mapper, "_insert", stopping)
+    assert main(call) == 130
+    assert f"what is matched is in {tmp_path / 'round.slam.npz'}" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["round.slam.npz"]
+    assert main(call) == 0
+    assert len(work) == len(true) + 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_poses_that_cannot_be_had_are_told(raw_log, tmp_path, capsys):
+    log, _ = raw_log
+    nowhere = str(tmp_path / "nowhere" / "t.txt")
+    assert main(["linemap", str(log), "--trajectory", nowhere]) == 2
+    assert f"error: {nowhere}: the folder {tmp_path / 'nowhere'} does not exist" in capsys.readouterr().err
+    # no odometry in it, no times in it
+    np.savez(tmp_path / "bare.npz", angles=np.linspace(-1, 1, 91), ranges=np.full((3, 91), 2.0))
+    bare = ["linemap", str(tmp_path / "bare.npz"), "--out", str(tmp_path / "x.json")]
+    assert main(bare) == 2
+    assert "no poses to map with: the .npz has no poses; --poses none finds better ones" in capsys.readouterr().err
+    assert main([*bare, "--poses", "odometry"]) == 2
+    assert "no odometry to go by: the .npz has no poses" in capsys.readouterr().err
+    assert main([*bare, "--poses", "none", "--trajectory", str(tmp_path / "t.txt")]) == 2
+    assert "the scans have no times: --trajectory cannot be written" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.json")) + list(tmp_path.glob("*.txt"))
+
+
 def test_many_broken_lines_are_counted(tmp_path, capsys):
     log = carmen(tmp_path / "room.log", *["FLASER 181 1.0"] * 25)
     assert main(["linemap", str(log), "--out", str(tmp_path / "a.json")]) == 0

@@ -5,11 +5,13 @@ from polyexplore_gym.mapping.extract import ScanLines, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
 from polyexplore_gym.mapping.localize import Correction, Localizer
 from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
-from polyexplore_gym.mapping.logs import LaserLog, read_log
+from polyexplore_gym.mapping.logs import LaserLog, Track, read_log, save_trajectory
 from polyexplore_gym.mapping.polylines import ScanPolylines, extract_polylines
+from polyexplore_gym.mapping.slam import Corrected, correct_poses, corrected_log
 
 __all__ = [
     "MAP_SUFFIXES",
+    "Corrected",
     "Correction",
     "LaserLog",
     "LineMap",
@@ -17,10 +19,14 @@ __all__ = [
     "LogMap",
     "ScanLines",
     "ScanPolylines",
+    "Track",
+    "correct_poses",
+    "corrected_log",
     "extract_lines",
     "extract_polylines",
     "map_log",
     "read_log",
     "save_map",
+    "save_trajectory",
     "sensor_of",
 ]

@@ -153,7 +153,7 @@ def map_log(
     """
     poses = log.poses
     if poses is None:
-        raise InvalidLogError(f"no poses to map with: {log.why or 'the log gives none'}")
+        raise InvalidLogError(f"no poses to map with: {log.why or 'the log gives none'}; {_remedy(log)}")
     sensor = sensor_of(log) if sensor is None else sensor
     config = MappingConfig(range_floor=0.01) if config is None else config
     for name, value, least in (
@@ -228,12 +228,26 @@ def map_log(
 
 
 def _misfit_text(misfit: float, log: LaserLog) -> str:
-    kind = {"odometry": "raw odometry", "corrected": "corrected ones", "unknown": "of unknown origin"}[log.poses_are]
+    kind = {
+        "odometry": "raw odometry",
+        "corrected": "corrected ones",
+        "unknown": "of unknown origin",
+        "matched": "what SLAM found",
+    }[log.poses_are]
     return (
         f"walls that were seen again do not fit: in half of the scans {100 * misfit:.0f} % of the beams or more pass "
-        f"through walls that they should have met; up to {100 * MISFIT:.0f} % is usual. The poses are wrong and have "
-        f"to be corrected first: they are {kind}{f' ({log.why})' if log.why else ''}"
+        f"through walls that they should have met; up to {100 * MISFIT:.0f} % is usual. The poses are wrong: they are "
+        f"{kind}{f' ({log.why})' if log.why else ''}; {_remedy(log)}"
     )
+
+
+def _remedy(log: LaserLog) -> str:
+    """What to do about poses that are wrong or missing."""
+    if log.poses_are == "matched":
+        return "scans at shorter distances, or a trajectory from elsewhere, are needed"
+    raw = log.odometry is not None or (log.poses is not None and log.poses_are != "corrected")
+    source = "odometry" if raw else "none"
+    return f'--poses {source} finds better ones from the scans (`correct_poses`, source="{source}")'
 
 
 def _check_returns(log: LaserLog, max_range: float) -> None:

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from line_scenes import HALF
 
-from polyexplore_gym.errors import InvalidLogError
+from polyexplore_gym.errors import InvalidLogError, ResultsError
 from polyexplore_gym.mapping import LaserLog
-from polyexplore_gym.mapping.logs import Track, deskewed, read_trajectory, with_trajectory
+from polyexplore_gym.mapping.logs import Track, deskewed, read_trajectory, save_trajectory, with_trajectory
 from polyexplore_gym.mapping.logs.poses import between, compose, wrap
 from polyexplore_gym.mapping.logs.trajectory import chosen, covered
 
@@ -45,6 +45,20 @@ def test_what_a_track_covers():
     times = np.array([-0.005, -0.1, 0.2, 2.0, 4.0, 3.005, 6.2, 6.6])
     assert covered(track, times).tolist() == [True, False, True, True, False, True, True, False]
     assert covered(Track(np.array([1.0]), np.zeros((1, 3))), np.array([1.0, 1.2])).tolist() == [True, False]
+
+
+def test_poses_are_read_as_they_were_written(tmp_path):
+    rng = np.random.default_rng(2)
+    times = 976052857.337484 + np.cumsum(rng.uniform(0.001, 0.5, 200))
+    track = Track(np.round(times, 6), np.c_[rng.uniform(-50, 50, (200, 2)), rng.uniform(-math.pi, math.pi, 200)])
+    save_trajectory(track, tmp_path / "poses.txt")
+    back = read_trajectory(tmp_path / "poses.txt")
+    np.testing.assert_allclose(back.times, track.times, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back.poses[:, :2], track.poses[:, :2], atol=1e-6)
+    np.testing.assert_allclose(wrap(back.poses[:, 2] - track.poses[:, 2]), 0.0, atol=1e-8)
+    assert [path.name for path in tmp_path.iterdir()] == ["poses.txt"]
+    with pytest.raises(ResultsError, match="cannot be written"):
+        save_trajectory(track, tmp_path / "nowhere" / "poses.txt")
 
 
 def test_a_file_of_poses_is_read(tmp_path):

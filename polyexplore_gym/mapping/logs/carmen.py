@@ -28,7 +28,7 @@ import numpy as np
 from polyexplore_gym.errors import InvalidLogError
 from polyexplore_gym.mapping.extract import LEAST_RANGE
 from polyexplore_gym.mapping.logs.poses import between, compose
-from polyexplore_gym.mapping.logs.record import FARTHEST, LEAST_BEAMS, MOST_BEAMS, WIDEST, Broken, LaserLog, Track
+from polyexplore_gym.mapping.logs.record import FARTHEST, LEAST_BEAMS, MOST_BEAMS, WIDEST, Broken, LaserLog, Track, Way
 
 MESSAGES = ("FLASER", "ROBOTLASER1", "RAWLASER1")
 """Messages with scans; the first that occurs in a log is read."""
@@ -317,6 +317,7 @@ class _Poses(NamedTuple):
     why: str
     odometry: np.ndarray | None
     track: Track | None
+    way: Way | None
     times: np.ndarray | None
     mount: np.ndarray | None
 
@@ -329,10 +330,12 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
     mount = np.array([found.mount.get(k, 0.0) for k in range(3)])
     if message == "RAWLASER1":
         if not len(odom):
-            return _Poses(None, "unknown", "RAWLASER1 has no poses and the log no ODOM lines", None, None, times, mount)
+            why = "RAWLASER1 has no poses and the log no ODOM lines"
+            return _Poses(None, "unknown", why, None, None, None, times, mount)
         poses = compose(_at_scans(odom, scans, times), mount)
         why = "RAWLASER1 has no poses: those of the ODOM lines"
-        return _Poses(poses, "odometry", why, poses, _track(odom, mount), times, mount)
+        way = _way(odom, mount, scans, poses)
+        return _Poses(poses, "odometry", why, poses, _track(odom, mount), way, times, mount)
 
     laser, robot = np.array([scan.pose[:3] for scan in scans]), np.array([scan.pose[3:] for scan in scans])
     of_robot = "odom_x odom_y odom_theta" if message == "FLASER" else "robot_x robot_y robot_theta"
@@ -340,26 +343,30 @@ def _poses(scans: list[_Scan], found: _Found) -> _Poses:
     if told:
         fixed = _constant(between(robot, laser))
         if fixed is None:
-            track = _track(odom, mount) if len(odom) and _follow(robot, odom, scans, times) else None
+            odometry = compose(robot, mount)
+            followed = bool(len(odom)) and _follow(robot, odom, scans, times)
+            track = _track(odom, mount) if followed else None
+            between_scans = _way(odom, mount, scans, odometry) if followed else None
             why = f"x y theta differ from {of_robot}"
-            return _Poses(laser, "corrected", why, compose(robot, mount), track, times, mount)
+            return _Poses(laser, "corrected", why, odometry, track, between_scans, times, mount)
         mount = fixed
     else:
         robot = compose(laser, between(mount, np.zeros(3)))
     same = f"x y theta go with {of_robot}" if told else f"{of_robot} do not move"
     if not len(odom):
         why = f"{same}, and there are no ODOM lines to tell by"
-        return _Poses(laser, "unknown", why, laser if told else None, None, times, mount)
+        return _Poses(laser, "unknown", why, laser if told else None, None, None, times, mount)
     if found.rewritten or _rewritten(robot, odom, scans):
-        odometry, track = _chained(robot, odom, scans, mount)
+        odometry, lines = _chained(robot, odom, scans, mount)
+        track, way = _track(lines, mount), _way(lines, mount, scans, odometry)
         sign = "there are the NEFF lines of GMapping" if found.rewritten else "they jump between the ODOM lines"
-        return _Poses(laser, "corrected", f"{same}, but {sign}", odometry, track, times, mount)
+        return _Poses(laser, "corrected", f"{same}, but {sign}", odometry, track, way, times, mount)
     if _follow(robot, odom, scans, times):
-        return _Poses(laser, "odometry", f"{same} and the ODOM lines", laser, _track(odom, mount), times, mount)
+        way = _way(odom, mount, scans, laser)
+        return _Poses(laser, "odometry", f"{same} and the ODOM lines", laser, _track(odom, mount), way, times, mount)
     odometry = compose(_at_scans(odom, scans, times), mount)
-    return _Poses(
-        laser, "corrected", f"{same}, but not with the ODOM lines", odometry, _track(odom, mount), times, mount
-    )
+    track, way = _track(odom, mount), _way(odom, mount, scans, odometry)
+    return _Poses(laser, "corrected", f"{same}, but not with the ODOM lines", odometry, track, way, times, mount)
 
 
 def _times(stamps: np.ndarray) -> np.ndarray | None:
@@ -394,6 +401,14 @@ def _track(odom: np.ndarray, mount: np.ndarray) -> Track | None:
     return Track.sorted(stamped[:, 0], compose(stamped[:, 1:], mount))
 
 
+def _way(odom: np.ndarray, mount: np.ndarray, scans: list[_Scan], at_scans: np.ndarray) -> Way:
+    """The ODOM lines (m, 4) and the poses of the laser at the scans (n, 3), as they follow each other."""
+    before = np.array([scan.before for scan in scans])
+    stamps = np.insert(odom[:, 0], before, [scan.time for scan in scans])
+    poses = np.insert(compose(odom[:, 1:], mount), before, at_scans, axis=0)
+    return Way(stamps, poses, before + np.arange(len(scans)))
+
+
 def _at_scans(odom: np.ndarray, scans: list[_Scan], times: np.ndarray | None) -> np.ndarray:
     """(n, 3) poses of the ODOM lines when the scans were taken: by time, or those of the line before each."""
     track = _track(odom, np.zeros(3))
@@ -422,8 +437,8 @@ def _rewritten(robot: np.ndarray, odom: np.ndarray, scans: list[_Scan]) -> bool:
 
 def _chained(
     robot: np.ndarray, odom: np.ndarray, scans: list[_Scan], mount: np.ndarray
-) -> tuple[np.ndarray, Track | None]:
-    """Raw odometry from a log in which it goes on from each corrected pose: poses at the scans (n, 3), and between."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Raw odometry from a log in which it goes on from each corrected pose: at the scans (n, 3), ODOM lines (m, 4)."""
     lines = odom.copy()
     out = [robot[0]]
     for k in range(1, len(scans)):
@@ -432,4 +447,4 @@ def _chained(
         out.append(lines[hi - 1, 1:] if hi > lo else compose(out[-1], between(robot[k - 1], robot[k])))
     lo = scans[-1].before
     lines[lo:, 1:] = compose(out[-1], between(robot[-1], odom[lo:, 1:]))
-    return compose(np.array(out), mount), _track(lines, mount)
+    return compose(np.array(out), mount), lines

@@ -50,6 +50,17 @@ class Track(NamedTuple):
         return np.stack([np.interp(times, self.times, c) for c in (*self.poses[:, :2].T, heading)], axis=1)
 
 
+class Way(NamedTuple):
+    """Odometry between the scans, in the order in which it was written: stamps may repeat or go back."""
+
+    stamps: np.ndarray
+    """(m,) s; NaN: none."""
+    poses: np.ndarray
+    """(m, 3) x, y (m) and heading (rad) of the laser by odometry alone."""
+    scans: np.ndarray
+    """(n,) which of them each scan was taken at."""
+
+
 @dataclass(frozen=True, slots=True)
 class LaserLog:
     """The scans of a log: n scans, the k-th of b_k beams. All poses are those of the laser, mounting applied."""
@@ -66,14 +77,17 @@ class LaserLog:
     """(n, 3, 3) covariance of the poses, m2, m rad, rad2, if the log gives it."""
     max_range: float | None = None
     """Range from which on a beam has no return, m, if the log gives it."""
-    poses_are: Literal["corrected", "odometry", "unknown"] = "unknown"
-    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; or the log does not say."""
+    poses_are: Literal["corrected", "odometry", "unknown", "matched"] = "unknown"
+    """corrected by a SLAM program or a localiser; raw odometry, then equal to `odometry`; the log does not say; or
+    matched: found from the scans by `correct_poses`."""
     why: str = ""
     """How that is known, for the user: a clause."""
     odometry: np.ndarray | None = None
     """(n, 3) pose by odometry alone when the scan was taken, in the odometry frame, if the log gives it."""
     track: Track | None = None
     """Odometry between the scans, in the odometry frame, if the log gives it with times."""
+    way: Way | None = None
+    """The same in the order of the file, with the scans in it, if the log gives it."""
     times: np.ndarray | None = None
     """(n,) when the pose of each scan holds, s, not always increasing, if the log gives it."""
     beam_times: Sequence[np.ndarray] | None = None

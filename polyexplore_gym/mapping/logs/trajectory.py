@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from polyexplore_gym.errors import InvalidLogError
+from polyexplore_gym.errors import InvalidLogError, ResultsError
 from polyexplore_gym.mapping.logs.record import FARTHEST, Broken, LaserLog, Track
 
 LONGEST_GAP = 1.0
@@ -56,6 +57,36 @@ def read_trajectory(path: str | Path) -> Track:
         raise InvalidLogError(f"{path}: holds no pose")
     data = np.array(rows)
     return Track.sorted(data[:, 0], data[:, 1:])
+
+
+def save_trajectory(track: Track, path: str | Path) -> None:
+    """Write poses in the plane, all digits of times, heights 0; in one go, so that there is no half a file.
+
+    Raises:
+        ResultsError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from polyexplore_gym.mapping.logs import Track, save_trajectory
+        >>> path = tempfile.mkdtemp() + "/poses.txt"
+        >>> save_trajectory(Track(np.array([0.5]), np.array([[1.0, 2.0, np.pi]])), path)
+        >>> print(open(path).read().splitlines()[1])
+        0.500000 1.000000 2.000000 0 0 0 1.000000000 0.000000000
+    """
+    path = Path(path)
+    lines = ["# time x y z qx qy qz qw"]
+    for time, (x, y, heading) in zip(track.times.tolist(), track.poses.tolist(), strict=True):
+        qz, qw = math.sin(0.5 * heading), math.cos(0.5 * heading)
+        lines.append(f"{time:.6f} {x:.6f} {y:.6f} 0 0 0 {qz:.9f} {qw + 0.0:.9f}")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        os.replace(part, path)
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _row(fields: list[str]) -> tuple[float, float, float, float]:
@@ -125,4 +156,5 @@ def chosen(log: LaserLog, keep: np.ndarray, broken: list[Broken]) -> LaserLog:
     for name in ("angles", "ranges", "beam_times"):
         value = getattr(log, name)
         fields[name] = None if value is None else tuple(value[k] for k in at)
-    return replace(log, **fields, broken=(*log.broken, *broken))
+    way = None if log.way is None else log.way._replace(scans=log.way.scans[at])
+    return replace(log, **fields, way=way, broken=(*log.broken, *broken))
