@@ -1,0 +1,158 @@
+"""What scans saw, each return moved onto the wall that it lies on, so that walls seen many times stand in one place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from numba import njit
+
+CLEARANCE = 0.05
+"""A return within this + 3 sigma of a wall lies on it, m: as `mapping.evidence` has it."""
+SPARE = 0.03
+"""A wall may be so much longer at each end than the map knows, m."""
+INSIDE = 0.1
+"""A beam that goes through a wall ends there only so far from the wall's ends, m: they are not known better."""
+OBLIQUE = math.cos(math.radians(87.0))
+"""A more oblique beam is not moved: along the beam the wall is far away."""
+BLOCK = 256
+"""So many scan polygons are joined at a time, which progress is shown by."""
+
+
+class Views(NamedTuple):
+    """S scans of B beams together, in the map frame, m."""
+
+    apexes: np.ndarray
+    """(S, 2) where each was made"""
+    first: np.ndarray
+    """(S + 1,) its first beam, and B"""
+    points: np.ndarray
+    """(B, 2) where the beams end, of a scan in the order of their bearings"""
+    hits: np.ndarray
+    """(B,) whether there was a return"""
+    full: np.ndarray
+    """(S,) whether a scan's last beam neighbours its first"""
+
+
+class Walls(NamedTuple):
+    """K segments of wall on L lines."""
+
+    segments: np.ndarray
+    """(K, 4) x1, y1, x2, y2, m; the free space lies on the left"""
+    line: np.ndarray
+    """(K,) the line of each"""
+    rho: np.ndarray
+    """(L,) x cos(alpha) + y sin(alpha) = rho, m"""
+    alpha: np.ndarray
+    """(L,) rad"""
+    sigma: np.ndarray
+    """(K,) standard deviation across each segment, m"""
+
+
+@njit(cache=True)
+def snap(
+    segments: np.ndarray,
+    sigma: np.ndarray,
+    apex: np.ndarray,
+    points: np.ndarray,
+    hits: np.ndarray,
+    var_range: float,
+    var_angle: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The beams of one scan, those that end on a wall or behind it moved along the beam to where they meet it.
+
+    Args:
+        segments, sigma: (K, 4) and (K,) of `Walls`.
+        apex: (2,) of the scan, m.
+        points, hits: (b, 2) and (b,) of its beams, by bearing.
+        var_range, var_angle: of the noise, m2 and rad2.
+
+    Returns:
+        The ends (b, 2), and which segment each lies on (b,), -1: none.
+    """
+    n = points.shape[0]
+    out, on = points.copy(), np.full(n, -1)
+    reach, bearing, off = np.empty(n), np.empty(n), np.full(n, np.inf)
+    for k in range(n):
+        dx, dy = points[k, 0] - apex[0], points[k, 1] - apex[1]
+        reach[k] = math.hypot(dx, dy)
+        bearing[k] = math.atan2(dy, dx)
+        if k:
+            turn = (bearing[k] - bearing[k - 1]) % (2.0 * math.pi)
+            bearing[k] = bearing[k - 1] + (turn if turn < math.pi else turn - 2.0 * math.pi)
+    farthest, stop = reach.max(), reach.copy()
+    for i in range(segments.shape[0]):
+        ax, ay = segments[i, 0] - apex[0], segments[i, 1] - apex[1]
+        ux, uy = segments[i, 2] - segments[i, 0], segments[i, 3] - segments[i, 1]
+        length = math.hypot(ux, uy)
+        if length < 1e-9:
+            continue
+        ux, uy = ux / length, uy / length
+        rho = ax * uy - ay * ux  # > 0: the apex lies on the left
+        if rho <= 0.0 or rho > farthest + CLEARANCE:
+            continue
+        low = math.atan2(ay - SPARE * uy, ax - SPARE * ux)
+        span = (math.atan2(ay + (length + SPARE) * uy, ax + (length + SPARE) * ux) - low) % (2.0 * math.pi)
+        low = bearing[0] + (low - bearing[0]) % (2.0 * math.pi) - 2.0 * math.pi
+        for _ in range(3):
+            for k in range(np.searchsorted(bearing, low), n):
+                if bearing[k] > low + span:
+                    break
+                c, s = math.cos(bearing[k]), math.sin(bearing[k])
+                across = c * uy - s * ux
+                if across < OBLIQUE:
+                    continue
+                at = rho / across
+                along = (at * c - ax) * ux + (at * s - ay) * uy
+                beyond = (reach[k] - at) * across
+                spread = var_range * across * across + var_angle * at * at * (1.0 - across * across) + sigma[i] ** 2
+                if hits[k] and abs(beyond) <= CLEARANCE + 3.0 * math.sqrt(spread):
+                    if abs(beyond) < off[k]:
+                        off[k], on[k], stop[k] = abs(beyond), i, at
+                elif beyond > 0.0 and INSIDE <= along <= length - INSIDE and at < stop[k]:
+                    off[k], on[k], stop[k] = 0.0, i, at  # seen through by a few, or it would have been cut
+            low += 2.0 * math.pi
+    for k in range(n):
+        if on[k] >= 0:
+            out[k, 0] = apex[0] + stop[k] * math.cos(bearing[k])
+            out[k, 1] = apex[1] + stop[k] * math.sin(bearing[k])
+    return out, on
+
+
+def seen(
+    views: Views,
+    walls: Walls,
+    sigma_range: float,
+    sigma_angle: float,
+    track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
+) -> tuple[Any, np.ndarray]:
+    """The area that the scans saw, up to the walls.
+
+    Args:
+        views, walls: what was seen, and the walls on which it ends.
+        sigma_range, sigma_angle: noise of the laser, m and rad.
+        track: wraps the scans, to show progress.
+
+    Returns:
+        The area (a shapely Polygon or MultiPolygon), and the returns (h, 2) that lie on no wall, m.
+    """
+    joined: list[Any] = []
+    polygons: list[Any] = []
+    loose = []
+    for i in track(range(len(views.apexes)), "outline"):
+        part = slice(views.first[i], views.first[i + 1])
+        points, hits = views.points[part], views.hits[part]
+        if len(points) < 3:
+            continue
+        ends, on = snap(walls.segments, walls.sigma, views.apexes[i], points, hits, sigma_range**2, sigma_angle**2)
+        loose.append(points[hits & (on < 0)])
+        ring = ends if views.full[i] else np.concatenate((views.apexes[i][None], ends))
+        polygons.append(shapely.Polygon(ring).buffer(0))
+        if len(polygons) == BLOCK:
+            joined.append(shapely.union_all(polygons))
+            polygons = []
+    joined.append(shapely.union_all(polygons))
+    return shapely.union_all(joined), np.concatenate(loose) if loose else np.zeros((0, 2))
