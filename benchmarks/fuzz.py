@@ -490,8 +490,11 @@ def run_scaled(number: int) -> dict[str, Any]:
     case = case_of(number)
     rng = np.random.default_rng([18, number])
     factor = float(4.0 ** rng.choice([-2, -1, 1, 2]))
-    if case.values["pose"]["mode"] == "slam":
-        return describe(case) | {"kind": "refused", "error": "slam looks every so many metres or radians"}
+    absolute = {"slam": "slam looks every so many metres or radians", "odometry": "drift is drawn every so many metres",
+                "utility": "the rate of utility is per metre"}  # fmt: skip
+    for name in (case.values["pose"]["mode"], case.criterion):
+        if name in absolute:
+            return describe(case) | {"kind": "refused", "error": absolute[name]}
     if case.start is None:
         case = _with_start(case, rng)
     result = describe(case) | {"factor": factor}
@@ -507,8 +510,8 @@ def run_scaled(number: int) -> dict[str, Any]:
     decisions, kind = 0, "same"
     try:
         while decisions < 200:
-            nodes = [(e.snapshot().node_positions[:64] / f, s[1]["action_mask"][: len(e.snapshot().node_positions)])
-                     for e, s, (_, f) in zip(envs, states, pairs, strict=True)]  # fmt: skip
+            nodes = [(e.exploration.chains.node[:, :2] / f, e.exploration.reachable)
+                     for e, (_, f) in zip(envs, pairs, strict=True)]  # fmt: skip
             size = float(np.ptp(case.plan.exterior, axis=0).max())
             if len(nodes[0][0]) != len(nodes[1][0]):
                 kind = "number of jump edges differs"

@@ -219,7 +219,8 @@ class ExplorationConfig:
     decide: Literal["arrival", "settled", "interval"] = "arrival"
     """When the next node is chosen. `arrival`: at the node (the paper). `settled`: also on the way, as soon as a scan
     has shown what the node was for. `interval`: also every `decide_every` metres. But for `arrival` the robot drives no
-    faster than lets it halt within `scan_every`: what it has learnt then comes in time."""
+    faster than lets it halt within `scan_every`: what it has learnt then comes in time. It slows down and looks again
+    where its disc would enter what no scan has shown."""
     decide_every: float = 1.0
     """interval: the node is chosen anew every so many metres of the way, m, at the next scan."""
     max_visits: int = 2

@@ -23,6 +23,7 @@ from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
 from polyexplore_gym.sim.pose import PoseModel
+from polyexplore_gym.sim.robot import contact_along
 from polyexplore_gym.sim.world import DriveResult, World
 from polyexplore_gym.snapshot import Snapshot
 
@@ -32,6 +33,9 @@ WINDOW_STEP = 0.5
 """Way between two pictures of a drive in the window, m."""
 _SCAN_TURN = 0.5 * math.pi
 """Scans on the way are also taken after so much turning (rad) or half the field of view, if that is less."""
+_CREEP, _HALT = 0.4, 0.1
+"""A robot that decides on the way looks again before its disc enters what no scan has shown, and in there after so many
+radii at a time; it can halt so many radii behind that place. Tuned: few bumps for little time."""
 _ON_THE_WAY = ("settled", "interval", "blocked")
 """Ends of a drive at a scan on the way: none is made in addition."""
 
@@ -297,16 +301,21 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         Returns why the drive ended, and what is left of the path. Both frames are those of the estimate.
         """
         assert self._world is not None
-        every = self.config.exploration.scan_every
+        c, radius = self.config.exploration, self.config.robot.radius
         distance = turn = math.inf
-        if every > 0.0:
+        if c.scan_every > 0.0:
             if not self.config.sensor.full_circle:
                 turn = min(_SCAN_TURN, 0.5 * self.config.sensor.field_of_view)
-            if np.hypot(*np.diff(path, axis=0).T).sum() > 1.5 * every:  # else the scan at the end will do
-                distance = every
-        true_path = self._pose_model.to_true(path)
+            if np.hypot(*np.diff(path, axis=0).T).sum() > 1.5 * c.scan_every:  # else the scan at the end will do
+                distance = c.scan_every
+        end, whole = path, True
+        if c.decide != "arrival":
+            seen = max(contact_along(self._exploration.pieces.segments, path, radius), _CREEP * radius)
+            distance = min(distance, seen)
+            end, whole = _cut_off(path, seen + _HALT * radius)
+        true_path = self._pose_model.to_true(end)
         true_path[0] = self._world.pose[:2]
-        true_heading = self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2]
+        true_heading = self._pose_model.to_true(np.array([[0.0, 0.0, heading]]))[0, 2] if whole else None
         result = self._take(self._world.drive(true_path, true_heading, distance=distance, turn=turn))
         rest = path[result.next_vertex :]
         return result.ended, np.concatenate((self._pose_model.estimate[None, :2], rest))
@@ -501,6 +510,16 @@ def _careful(config: EnvConfig) -> RobotConfig:
         return robot
     speed = math.sqrt(2.0 * robot.max_acceleration * exploration.scan_every)
     return dataclasses.replace(robot, max_speed=min(robot.max_speed, speed))
+
+
+def _cut_off(path: np.ndarray, way: float) -> tuple[np.ndarray, bool]:
+    """The first so many metres of a path (k, 2), and whether that is all of it."""
+    run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+    if way >= run[-1]:
+        return path, True
+    k = int(np.searchsorted(run, way))
+    share = (way - run[k - 1]) / (run[k] - run[k - 1])
+    return np.concatenate((path[:k], path[k - 1 : k] + share * (path[k] - path[k - 1]))), False
 
 
 def _suite(name: str) -> Suite:

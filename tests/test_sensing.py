@@ -81,6 +81,14 @@ def test_moving_is_shorter_than_stopping():
     assert np.mean(ratio) < 0.9
 
 
+@pytest.mark.parametrize(("family", "seed"), [("home", 32), ("angled", 20), ("angled", 22), ("office", 21)])
+def test_a_robot_that_looks_before_it_enters_the_unknown_does_not_bump(family, seed):
+    """With the node on the jump edge half the disc stands in what nobody has seen: 1 to 4 bumps each without."""
+    info = play(PolyExploreEnv(generate(family, seed), config=config("physics", placement="midpoint")))[-1]
+    assert info["outcome"]["status"] == "complete"
+    assert info["collisions"] == 0
+
+
 def test_arrival_drives_to_the_end():
     env = PolyExploreEnv(generate("home", 3), config=config(decide="arrival"))
     infos = play(env)

@@ -24,6 +24,8 @@ _ALIKE = 0.27
 """Cosine of the largest angle (that of `_MAX_TURN`) between the directions in which parts of one opening face."""
 _SQUARE = 0.26
 """Cosine of the largest incidence (75 degrees) under which a look shows what is behind an open edge."""
+_GAPPY = 2.5
+"""An opening is at most so many times as wide as what is left of its edges: crumbs far apart are none."""
 _LOOKS = 2
 """Fewest beams across a gap of interest with which a look shows what is behind it (Ekman's sampling condition)."""
 
@@ -193,12 +195,14 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
         n_kept = 1
         # The point that must be seen lies no farther beyond the piece than this.
         beyond = tol.nudge + 2.0 * max(sigma[i], noise_at(reach, tol))
-        x0 = min(ax, bx) - beyond
-        x1 = max(ax, bx) + beyond
-        y0 = min(ay, by) - beyond
-        y1 = max(ay, by) + beyond
+        lx, ly, hx, hy = ax, ay, bx, by  # ends of what is left
         for s in range(last - 1, first - 1, -1):  # the latest look was from near by
-            if scans.boxes[s, 2] < x0 or scans.boxes[s, 0] > x1 or scans.boxes[s, 3] < y0 or scans.boxes[s, 1] > y1:
+            if (
+                scans.boxes[s, 2] < min(lx, hx) - beyond
+                or scans.boxes[s, 0] > max(lx, hx) + beyond
+                or scans.boxes[s, 3] < min(ly, hy) - beyond
+                or scans.boxes[s, 1] > max(ly, hy) + beyond
+            ):
                 continue
             px = scans.apexes[s, 0]
             py = scans.apexes[s, 1]
@@ -209,10 +213,10 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
             ox = nudge * (by - ay)
             oy = nudge * (ax - bx)
             if (
-                max(ax, bx) + ox < scans.boxes[s, 0]
-                or min(ax, bx) + ox > scans.boxes[s, 2]
-                or max(ay, by) + oy < scans.boxes[s, 1]
-                or min(ay, by) + oy > scans.boxes[s, 3]
+                max(lx, hx) + ox < scans.boxes[s, 0]
+                or min(lx, hx) + ox > scans.boxes[s, 2]
+                or max(ly, hy) + oy < scans.boxes[s, 1]
+                or min(ly, hy) + oy > scans.boxes[s, 3]
             ):
                 continue
             n_cut = inside_intervals(
@@ -222,6 +226,8 @@ def clip(pieces, sigma, scans, first, last, walls, tol):
             kept, n_kept = subtract(kept, n_kept, cut, n_cut)
             if n_kept == 0:
                 break
+            lx, ly = ax + kept[0, 0] * (bx - ax), ay + kept[0, 0] * (by - ay)
+            hx, hy = ax + kept[n_kept - 1, 1] * (bx - ax), ay + kept[n_kept - 1, 1] * (by - ay)
         if n_kept > 0:
             kept, n_kept = _take_off(ax, ay, bx, by, walls, boxes, tol.cover, False, kept, n_kept, cut)
         if n_kept != 1 or kept[0, 0] > 1e-9 or kept[0, 1] < 1.0 - 1e-9:
@@ -707,7 +713,7 @@ def summarise(segments, kinds, visits, order, offsets, walls, next_id, tol):
         if out.width[q] < tol.gap:  # else wide enough
             out.width[q] += _to_wall(out.ends[q, 0], out.ends[q, 1], walls, tol)
             out.width[q] += _to_wall(out.ends[q, 2], out.ends[q, 3], walls, tol)
-        out.width[q] = min(out.width[q], 1.6 * total)  # crumbs far apart are no opening
+        out.width[q] = min(out.width[q], _GAPPY * total)
         if out.width[q] >= tol.gap - 3.0 * tol.sigma_range:  # else too narrow anyhow
             out.room[q] = _room(segments, order[offsets[q] : offsets[q + 1]], walls, tol)
         run = 0.0

@@ -145,6 +145,24 @@ def _cut(v, w, links):
 
 
 @njit(cache=True)
+def trail_under(x, y, vertices, n, links, tol):
+    """The ends (k,) of the edges at vertices of the way driven, all but those to leaves, on which a place lies."""
+    on = np.zeros(n, np.bool_)
+    for u in range(n):
+        if vertices.kind[u] != CORNER or vertices.shape.limit[u] != TRAIL:
+            continue
+        ux, uy = vertices.position[u]
+        if abs(ux - x) > tol.anchor or abs(uy - y) > tol.anchor:
+            continue
+        for h in range(links.first[u], links.first[u] + links.degree[u]):
+            v = links.target[h]
+            vx, vy = vertices.position[v]
+            if vertices.kind[v] != LEAF and point_segment_distance(x, y, ux, uy, vx, vy) < tol.crumb:
+                on[u] = on[v] = True
+    return np.flatnonzero(on)
+
+
+@njit(cache=True)
 def isolate(vertices, links):
     """Take all edges of the vertices out."""
     for v in vertices:

@@ -487,8 +487,9 @@ class ExplorationMap:
         if at != (x, y):
             self._start.insert(0, (x, y))
         self.robot = int(g.add_leaves(np.array(self._start[-1:]), np.array([-2]))[0])
-        if g.clearance(*self._start[-1]) < self.tol.need:
-            g.join_trail(self.robot, g.trail_at(*self._start[-1]))
+        on_trail = g.trail_at(*self._start[-1])
+        if len(on_trail):
+            g.join_trail(self.robot, on_trail)
         c = self.chains
         reach = self.tol.max_range
         local = np.all((c.middle >= self._box[:2] - reach) & (c.middle <= self._box[2:] + reach), axis=1)

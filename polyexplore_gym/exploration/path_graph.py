@@ -36,6 +36,7 @@ from polyexplore_gym.exploration.links import (
     isolate,
     repack,
     sever,
+    trail_under,
     unblocked,
 )
 from polyexplore_gym.exploration.scan_polygon import EVERYTHING, Scans
@@ -177,6 +178,7 @@ class PathGraph:
         self.dist = np.full((16, 256), math.inf)
         self.parent = np.full((16, 256), -1, np.int32)
         self.felt = 0
+        self._has_trail = False
         self._segments = np.zeros((0, 4))
         self._alive = np.zeros(0, np.bool_)
         self._touched_felt = np.zeros(0, np.int64)
@@ -329,6 +331,7 @@ class PathGraph:
 
         Only the points that no corner can stand for are laid, and those between two parts of the graph.
         """
+        self._has_trail = True
         anchor = self._laid_before(points)
         new = anchor < 0
         anchor[new] = anchors(points[new], self.vertices, self.n_vertices, self.walls, self.pieces, self.tol)
@@ -351,15 +354,10 @@ class PathGraph:
         self._insert(pairs, length, np.zeros(len(pairs)))
 
     def trail_at(self, x: float, y: float) -> np.ndarray:
-        """The ends (k,) of those legs of the way laid by `add_trail` on which a place lies."""
-        n, position = self.n_vertices, self.vertices.position
-        laid = (self.vertices.kind[:n] == CORNER) & (self.vertices.shape.limit[:n] == TRAIL)
-        near = np.flatnonzero(laid & (np.abs(position[:n] - (x, y)) < self.tol.trail_edge).all(axis=1)).tolist()
-        ends = [
-            (u, v) for u in near for v in self.neighbours(u)
-            if v > u and laid[v] and point_segment_distance(x, y, *position[u], *position[v]) < self.tol.crumb
-        ]  # fmt: skip
-        return np.unique(np.array(ends, np.int64))
+        """The ends (k,) of those edges from the way laid by `add_trail` on which a place lies."""
+        if not self._has_trail:
+            return np.zeros(0, np.int64)
+        return trail_under(x, y, self.vertices, self.n_vertices, self.links, self.tol)
 
     def join_trail(self, leaf: int, ends: np.ndarray) -> None:
         """Join a leaf that stands on the way driven to vertices (k,) of it: it leads from there to both sides."""

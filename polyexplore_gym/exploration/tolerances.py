@@ -72,7 +72,7 @@ class Tolerances(NamedTuple):
     short_leg: float
     """legs up to this length need not be taut: the vertices of a corner need not stand just where they should"""
     leg: float
-    """longest edges of the path graph between its own vertices: a little more than is seen at once"""
+    """longest edges of the path graph between its own vertices: more than is seen at once"""
     last_leg: float
     """... and to where paths end"""
     way_point: float
@@ -147,8 +147,8 @@ def tolerances(config: ExplorationConfig, sensor: SensorConfig, radius: float) -
         same_vertex=0.4 * r,
         same_corner=0.12 * r,
         short_leg=2.8 * r,
-        leg=max(1.25 * reach, 40.0 * r),
-        last_leg=max(2.0 * reach, 60.0 * r),
+        leg=max(2.0 * reach, 40.0 * r),
+        last_leg=max(4.0 * reach, 60.0 * r),
         way_point=16.0 * r,
         corner_near=6.0 * r,
         aside=0.6 * r,

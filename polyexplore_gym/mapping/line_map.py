@@ -73,7 +73,8 @@ class LineMap:
             Rows added, changed (an end moved by 0.4 % of a door's width or more) or removed, ascending.
 
         Raises:
-            ValueError: pose or covariance has the wrong shape or is not finite.
+            ValueError: pose or covariance has the wrong shape or is not finite; or `lines.lone` is not of one entry a
+                fragment.
         """
         pose = np.ascontiguousarray(pose, np.float64)
         covariance = np.ascontiguousarray(covariance, np.float64)
@@ -81,6 +82,9 @@ class LineMap:
             raise ValueError(f"pose and covariance must be (3,) and (3, 3), got {pose.shape} and {covariance.shape}")
         if not (np.isfinite(pose).all() and np.isfinite(covariance).all()):
             raise ValueError(f"pose and covariance must be finite, got {pose} and {covariance}")
+        lone = np.zeros(len(lines.fragments), np.bool_) if lines.lone is None else lines.lone
+        if lone.shape != (len(lines.fragments),):
+            raise ValueError(f"lone must be of shape ({len(lines.fragments)},), got {lone.shape}")
         self._reserve(lines.segments.shape[0] + lines.fragments.shape[0], lines.rho.size)
         slots = self._slots
         if not drifting:
@@ -88,8 +92,7 @@ class LineMap:
         information = np.linalg.pinv(covariance, hermitian=True) if drifting else np.zeros((3, 3))
         insert(
             lines.rho, lines.alpha, lines.covariance, lines.segments, lines.segment_line, lines.fragments,
-            np.zeros(len(lines.fragments), np.bool_) if lines.lone is None else lines.lone,
-            pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
+            lone, pose, covariance, self._var_range, self._var_angle, self.config.merge_gate, self._door,
             self.config.straightness, self.config.grouping, drifting, pose[:2] - self._pose[:2], information,
             self._rows, self._lines, self._grid, slots,
         )  # fmt: skip

@@ -170,6 +170,24 @@ def first_contact(segments, x, y, dx, dy, radius, standoff):  # type: ignore[no-
 
 
 @njit(cache=True)
+def contact_along(segments, path, radius):  # type: ignore[no-untyped-def]
+    """Way (m) along a path (k, 2) after which a disc touches a segment (m, 4); inf if it touches none.
+
+    One that it touches at the start counts only if it moves into it.
+    """
+    way = 0.0
+    for k in range(path.shape[0] - 1):
+        x, y = path[k]
+        dx, dy = path[k + 1, 0] - x, path[k + 1, 1] - y
+        length = math.hypot(dx, dy)
+        contact, _ = first_contact(segments, x, y, dx, dy, radius, 0.0)
+        if contact <= 1.0:
+            return way + contact * length
+        way += length
+    return np.inf
+
+
+@njit(cache=True)
 def _touching(segments, x, y, radius):  # type: ignore[no-untyped-def]
     """Walls that a disc touches: index, normal (towards the disc) and place of the contact along the wall (0 to 1)."""
     out = np.empty((segments.shape[0], 4))

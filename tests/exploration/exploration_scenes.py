@@ -201,7 +201,7 @@ def shortest_lengths(area: shapely.Geometry, points: np.ndarray) -> np.ndarray:
 def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
     """Width of the opening behind a chain of open edges (m, 4) in order: the gaps in it and on to the walls count.
 
-    What runs round the tip of a shadow is as wide as its bounding box at most, crumbs as 1.6 times their length.
+    What runs round the tip of a shadow is as wide as its bounding box at most, crumbs as 2.5 times their length.
     """
     edges = shapely.linestrings(chain.reshape(-1, 2, 2))
     total = shapely.length(edges).sum()
@@ -211,7 +211,7 @@ def width_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:
     for end in (chain[0, :2], chain[-1, 2:]) if width < tol.gap else ():
         away = lines_of(walls).distance(shapely.Point(end)) if len(walls) else math.inf
         width += away if away < tol.cover + tol.join else 0.0
-    return float(min(width, 1.6 * total))
+    return float(min(width, 2.5 * total))
 
 
 def room_of(chain: np.ndarray, walls: np.ndarray, tol: Tolerances) -> float:

@@ -283,7 +283,7 @@ def test_width_of_an_opening():
     far = EXACT.cover + EXACT.join + 0.001
     assert width([[0, 0, 0.4, 0]], np.array([[-far, 0, -far, 3]])) == pytest.approx(0.4)
     # Crumbs far apart are no opening.
-    assert width([[0, 0, 0.03, 0], [0.4, 0, 0.43, 0]]) == pytest.approx(1.6 * 0.06)
+    assert width([[0, 0, 0.03, 0], [0.4, 0, 0.43, 0]]) == pytest.approx(2.5 * 0.06)
     # What is wide enough is left alone.
     assert width([[0, 0, 0.6, 0]], walls) == pytest.approx(0.6)
 

@@ -60,7 +60,7 @@ def test_without_grouping_lines_enter_the_map_as_if_from_scans_of_their_own():
     for seed in range(12):
         pose = np.array([*rng.uniform(-0.6, 0.6, 2), rng.uniform(-math.pi, math.pi)])
         covariance = np.diag([0.02, 0.02, math.radians(0.5)]) ** 2
-        lines = dataclasses.replace(scan(jagged_room(rng), pose, seed, APART), fragments=np.zeros((0, 4)))
+        lines = dataclasses.replace(scan(jagged_room(rng), pose, seed, APART), fragments=np.zeros((0, 4)), lone=None)
         together.insert(lines, pose, covariance)
         for i in range(lines.rho.size):
             own = lines.segment_line == i

@@ -259,7 +259,9 @@ def test_what_is_new_at_one_place_only_stays_as_a_fragment():
     line_map.insert(one_line([(-1.0, 1.0)]), np.zeros(3), EXACT)
     nothing = extract_lines(HALF, np.full(361, np.inf))
     fragment = np.array([[2.0, 1.05, 2.0, 1.09]])
-    touched = line_map.insert(dataclasses.replace(nothing, fragments=fragment), np.zeros(3), EXACT)
+    with pytest.raises(ValueError, match=r"lone must be of shape \(1,\)"):
+        line_map.insert(dataclasses.replace(nothing, fragments=fragment), np.zeros(3), EXACT)
+    touched = line_map.insert(dataclasses.replace(nothing, fragments=fragment, lone=None), np.zeros(3), EXACT)
     np.testing.assert_array_equal(touched, [1])
     np.testing.assert_allclose(line_map.segments[1], [2.0, 1.07, 2.0, 1.09])
 

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import shapely
+import shapely.ops
 from sim_scenes import clear_point, lines_of, random_walls
 
 from polyexplore_gym.sim.robot import (
@@ -13,6 +14,7 @@ from polyexplore_gym.sim.robot import (
     advance,
     apart,
     bounded,
+    contact_along,
     first_contact,
     glide,
     is_free,
@@ -66,6 +68,28 @@ def test_first_contact_agrees_with_shapely() -> None:
         gap = shapely.distance(shapely.linestrings(hit), shapely.points(start + stop * way)) - radius
         assert gap == pytest.approx(STANDOFF * radius, abs=1e-7)
     assert hits > 300
+
+
+def test_contact_along_a_path_agrees_with_shapely() -> None:
+    rng, radius, hits = np.random.default_rng(2), 0.25, 0
+    for _ in range(300):
+        walls = random_walls(rng, int(rng.integers(1, 25)), side=8.0)
+        start = clear_point(rng, walls, 5.0, radius)
+        path = np.vstack([start, start + np.cumsum(rng.uniform(-1.5, 1.5, (4, 2)), axis=0)])
+        path[2] = path[1]  # one leg of no length
+        line, lines = shapely.linestrings(path), lines_of(walls)
+        way = contact_along(walls, path, radius)
+        if way == np.inf:
+            assert shapely.distance(line, lines) >= radius - 2e-9
+            continue
+        hits += 1
+        assert shapely.distance(shapely.line_interpolate_point(line, way), lines) == pytest.approx(radius, abs=1e-7)
+        if way > 1e-6:
+            assert shapely.distance(shapely.ops.substring(line, 0.0, way - 1e-7), lines) >= radius - 2e-9
+    assert 50 < hits < 290
+    touched = np.array([[0.0, 1.0, 4.0, 1.0]])
+    assert contact_along(touched, np.array([[1.0, 0.8], [2.0, 0.8], [2.0, 0.9]]), 0.25) == pytest.approx(1.0)
+    assert contact_along(touched, np.array([[1.0, 0.8], [1.0, 0.0]]), 0.25) == np.inf
 
 
 def test_a_disc_that_touches_a_wall_may_leave_it_but_not_enter() -> None:
