@@ -1,5 +1,6 @@
 """The line map: scan -> lines (`extract_lines`) -> map across scans (`LineMap`); `read_log` and `map_log` for logs."""
 
+from polyexplore_gym.mapping.evidence import Beams
 from polyexplore_gym.mapping.export import MAP_SUFFIXES, save_map
 from polyexplore_gym.mapping.extract import ScanLines, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
@@ -7,9 +8,11 @@ from polyexplore_gym.mapping.localize import Correction, Localizer
 from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
 from polyexplore_gym.mapping.logs import LaserLog, read_log
 from polyexplore_gym.mapping.polylines import ScanPolylines, extract_polylines
+from polyexplore_gym.mapping.walls import Walls, walls_of, walls_of_log
 
 __all__ = [
     "MAP_SUFFIXES",
+    "Beams",
     "Correction",
     "LaserLog",
     "LineMap",
@@ -17,10 +20,13 @@ __all__ = [
     "LogMap",
     "ScanLines",
     "ScanPolylines",
+    "Walls",
     "extract_lines",
     "extract_polylines",
     "map_log",
     "read_log",
     "save_map",
     "sensor_of",
+    "walls_of",
+    "walls_of_log",
 ]

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from polyexplore_gym.outline.views import CLEARANCE, SPARE, Walls
+from polyexplore_gym.mapping import Walls
+from polyexplore_gym.outline.views import CLEARANCE, SPARE
 
 ON_LINE = 1e-5
 """What was moved onto a line lies within this of it, m: rounding of the overlay."""

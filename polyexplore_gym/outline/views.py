@@ -10,6 +10,8 @@ import numpy as np
 import shapely
 from numba import njit
 
+from polyexplore_gym.mapping import Beams, Walls
+
 CLEARANCE = 0.05
 """A return within this + 3 sigma of a wall lies on it, m: as `mapping.evidence` has it."""
 SPARE = 0.03
@@ -18,12 +20,16 @@ INSIDE = 0.1
 """A beam that goes through a wall ends there only so far from the wall's ends, m: they are not known better."""
 OBLIQUE = math.cos(math.radians(87.0))
 """A more oblique beam is not moved: along the beam the wall is far away."""
+APART = 2.5
+"""Between beams that are so many times as far apart as is usual in their scan nothing is known."""
+LEAST_RANGE = 1e-6
+"""Nothing is known of a beam with a shorter range, m."""
 BLOCK = 256
 """So many scan polygons are joined at a time, which progress is shown by."""
 
 
 class Views(NamedTuple):
-    """S scans of B beams together, in the map frame, m."""
+    """What S scans saw, B beams together, in the map frame, m."""
 
     apexes: np.ndarray
     """(S, 2) where each was made"""
@@ -33,23 +39,28 @@ class Views(NamedTuple):
     """(B, 2) where the beams end, of a scan in the order of their bearings"""
     hits: np.ndarray
     """(B,) whether there was a return"""
-    full: np.ndarray
-    """(S,) whether a scan's last beam neighbours its first"""
+    apart: np.ndarray
+    """(B,) whether nothing is known between a beam and the next one of its scan, or the first after the last"""
 
 
-class Walls(NamedTuple):
-    """K segments of wall on L lines."""
-
-    segments: np.ndarray
-    """(K, 4) x1, y1, x2, y2, m; the free space lies on the left"""
-    line: np.ndarray
-    """(K,) the line of each"""
-    rho: np.ndarray
-    """(L,) x cos(alpha) + y sin(alpha) = rho, m"""
-    alpha: np.ndarray
-    """(L,) rad"""
-    sigma: np.ndarray
-    """(K,) standard deviation across each segment, m"""
+def views_of(scans: Iterable[Beams], max_range: float) -> Views:
+    """The scans in the map frame; beams of which nothing is known are left out, and with them what lies about them."""
+    apexes, points, hits, apart = [], [], [], []
+    for scan in scans:
+        known = (scan.ranges >= LEAST_RANGE) & np.isfinite(scan.angles)
+        angles, ranges = scan.angles[known], np.minimum(scan.ranges[known], max_range)
+        if angles.size < 3:
+            continue
+        step = np.diff(angles, append=angles[0] + 2.0 * math.pi)
+        apexes.append(scan.pose[:2])
+        bearing = angles + scan.pose[2]
+        points.append(scan.pose[:2] + ranges[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1))
+        hits.append(ranges < max_range - 1e-9)
+        apart.append(step > APART * np.median(step))
+    first = np.concatenate(([0], np.cumsum([len(some) for some in points])))
+    if not apexes:
+        return Views(np.zeros((0, 2)), first, np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(0, np.bool_))
+    return Views(np.array(apexes), first, np.concatenate(points), np.concatenate(hits), np.concatenate(apart))
 
 
 @njit(cache=True)
@@ -147,9 +158,11 @@ def seen(
         points, hits = views.points[part], views.hits[part]
         if len(points) < 3:
             continue
-        ends, on = snap(walls.segments, walls.sigma, views.apexes[i], points, hits, sigma_range**2, sigma_angle**2)
+        noise = sigma_range**2, sigma_angle**2
+        ends, on = snap(walls.segments, walls.sigma, views.apexes[i], points, hits, *noise)
         loose.append(points[hits & (on < 0)])
-        ring = ends if views.full[i] else np.concatenate((views.apexes[i][None], ends))
+        gaps = np.flatnonzero(views.apart[part]) + 1
+        ring = np.insert(ends, gaps, views.apexes[i], axis=0)
         polygons.append(shapely.Polygon(ring).buffer(0))
         if len(polygons) == BLOCK:
             joined.append(shapely.union_all(polygons))

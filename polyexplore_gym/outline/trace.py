@@ -1,0 +1,185 @@
+"""The outline of what was seen, as one valid polygon made of the map's lines: `trace`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from polyexplore_gym.errors import InvalidFloorPlanError
+from polyexplore_gym.mapping import Walls
+from polyexplore_gym.outline.polygon import corners, crossings, straightened
+from polyexplore_gym.outline.sides import Side, labels, reduced, sides_of
+from polyexplore_gym.outline.views import Views, seen
+
+TOLERANCE = 0.04
+"""Greatest deviation of what was measured from a side that stands for it, m."""
+REACH = 0.5
+"""What nobody saw is closed by the walls on both sides where they meet within this, m."""
+LEAST_HOLE = 0.03
+"""Holes narrower than this (twice the area over the perimeter), m, are noise."""
+STEP = 0.05
+"""Known and unknown boundary are told apart every so many metres."""
+NEAR = 0.1
+"""Boundary is known where a wall or a return lies so near, m."""
+
+
+class Outline(NamedTuple):
+    """What was seen, closed."""
+
+    exterior: np.ndarray
+    """(n, 2) counter-clockwise, m"""
+    holes: tuple[np.ndarray, ...]
+    """clockwise, (k, 2) each"""
+    unknown: np.ndarray
+    """(U, 4) stretches x1, y1, x2, y2 of the boundary, m, where no wall was seen: beyond them the plan may go on"""
+    perimeter: float
+    """of all rings, m"""
+    left_out: float
+    """area that was seen but is not connected to the place asked for, m2"""
+
+    @property
+    def unknown_length(self) -> float:
+        """Length of the unknown boundary, m."""
+        return float(np.hypot(*(self.unknown[:, 2:] - self.unknown[:, :2]).T).sum())
+
+    @property
+    def unknown_share(self) -> float:
+        """Share of the unknown boundary in all, 0 to 1."""
+        return self.unknown_length / self.perimeter
+
+
+def trace(
+    views: Views,
+    walls: Walls,
+    at: np.ndarray,
+    sigma_range: float,
+    sigma_angle: float,
+    *,
+    tolerance: float = TOLERANCE,
+    track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
+) -> Outline:
+    """The outline of what scans saw.
+
+    Args:
+        views, walls: what was seen, and the walls that are left when all beams have been held against them.
+        at: (2,) a place in the part that is wanted, such as where the robot stands, m.
+        sigma_range, sigma_angle: noise of the laser, m and rad.
+        tolerance: greatest deviation of what was measured from a side that stands for it, m.
+        track: wraps the scans, to show progress.
+
+    Raises:
+        InvalidFloorPlanError: nothing was seen.
+    """
+    area, loose = seen(views, walls, sigma_range, sigma_angle, track)
+    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and part.area > 0.0]
+    if not parts:
+        raise InvalidFloorPlanError("no floor plan: the scans saw no area")
+    point = shapely.Point(at[:2])
+    part = min(parts, key=lambda p: (p.distance(point), -p.area))
+    holes = [ring for ring in part.interiors if 2.0 * shapely.Polygon(ring).area > LEAST_HOLE * ring.length]
+    part = shapely.normalize(shapely.Polygon(part.exterior, holes)).reverse()  # exterior counter-clockwise
+    rings = [shapely.get_coordinates(ring)[:-1] for ring in (part.exterior, *part.interiors)]
+    rings = [ring if _area(ring) > 0 == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
+    wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
+    loose_tree = _tree(loose, shapely.points)
+    sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
+    done = _polygon(rings, sides)
+    known = [tree for tree in (wall_tree, loose_tree) if tree is not None]
+    return Outline(done[0], tuple(done[1:]), _unknown(done, known), _length(done), sum(p.area for p in parts) - part.area)
+
+
+def _area(ring: np.ndarray) -> float:
+    after = np.roll(ring - ring[0], -1, axis=0)
+    return 0.5 * float(((ring - ring[0])[:, 0] * after[:, 1] - after[:, 0] * (ring - ring[0])[:, 1]).sum())
+
+
+def _tree(points: np.ndarray, shape: Any) -> Any:
+    return shapely.STRtree(shape(points)) if len(points) else None
+
+
+def _sides(ring: np.ndarray, walls: Walls, wall_tree: Any, loose_tree: Any, tolerance: float) -> list[Side]:
+    sides = sides_of(ring, labels(ring, walls, wall_tree), walls, loose_tree, tolerance)
+    return reduced(sides, ring, tolerance, REACH)
+
+
+def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarray]:
+    """Rings of a valid polygon: where sides cross, the boundary as it was seen takes their place."""
+    while True:
+        made, owners = [], []
+        for ring, some in zip(rings, sides, strict=True):
+            points, owner = straightened(*corners(some, ring, REACH))
+            made.append(points)
+            owners.append(owner)
+        bad = _faults(made)
+        if not bad:
+            return made
+        again = False
+        for k, edge in bad:
+            some, owner = sides[k], int(owners[k][edge]) if edge < len(owners[k]) else -1
+            which = range(len(some)) if owner < 0 and edge < 0 else [owner] if owner >= 0 else _beside(owners[k], edge)
+            for i in which:
+                again |= _as_seen(some, i, len(rings[k]))
+        if not again:  # the boundary as it was seen is valid: unless all of a ring is meant
+            for k, _ in bad:
+                for i in range(len(sides[k])):
+                    again |= _as_seen(sides[k], i, len(rings[k]))
+        if not again:
+            raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
+
+
+def _beside(owner: np.ndarray, edge: int) -> list[int]:
+    """The sides before and after a step between two."""
+    n = len(owner)
+    return [int(owner[(edge + k) % n]) for k in (-1, 1) if owner[(edge + k) % n] >= 0]
+
+
+def _as_seen(sides: list[Side], i: int, n: int) -> bool:
+    """Let a side be the boundary as it was seen, on to the next side; whether that changes anything."""
+    side = sides[i]
+    if side.raw:
+        return False
+    side.raw = True
+    after = sides[(i + 1) % len(sides)]
+    side.stop = side.start + ((after.start - side.start) % n or n)
+    return True
+
+
+def _faults(rings: list[np.ndarray]) -> set[tuple[int, int]]:
+    """Ring and edge of what makes a polygon invalid; edge -1: all of a ring."""
+    bad = {(k, -1) for k, ring in enumerate(rings) if len(ring) < 3 or (_area(ring) > 0) != (k == 0)}
+    if bad:
+        return bad
+    bad = crossings(rings)
+    if bad:
+        return bad
+    outer = shapely.Polygon(rings[0])
+    for k, ring in enumerate(rings[1:], 1):
+        if not outer.covers(shapely.Polygon(ring)):
+            bad.add((k, -1))
+    if not bad and not shapely.Polygon(rings[0], rings[1:]).is_valid:
+        bad = {(k, -1) for k in range(len(rings))}
+    return bad
+
+
+def _length(rings: list[np.ndarray]) -> float:
+    return float(sum(np.hypot(*(np.roll(ring, -1, axis=0) - ring).T).sum() for ring in rings))
+
+
+def _unknown(rings: list[np.ndarray], trees: list[Any]) -> np.ndarray:
+    """(U, 4) stretches of the rings, m, longer than twice `NEAR`, to which nothing that was measured lies near."""
+    out = []
+    for ring in rings:
+        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            length = math.hypot(*(b - a))
+            n = max(math.ceil(length / STEP), 1)
+            points = shapely.points(a + (np.arange(n)[:, None] + 0.5) / n * (b - a))
+            open_ = np.ones(n, np.bool_)
+            for tree in trees:
+                open_[tree.query(points, predicate="dwithin", distance=NEAR)[0]] = False
+            edges = np.flatnonzero(np.diff(open_.astype(int), prepend=0, append=0)).reshape(-1, 2) / n
+            out += [[*(a + s * (b - a)), *(a + t * (b - a))] for s, t in edges if (t - s) * length > 2 * STEP]
+    return np.array(out).reshape(-1, 4)
