@@ -81,9 +81,9 @@ def trace(
     point = shapely.Point(at[:2])
     part = min(parts, key=lambda p: (p.distance(point), -p.area))
     holes = [ring for ring in part.interiors if 2.0 * shapely.Polygon(ring).area > LEAST_HOLE * ring.length]
-    part = shapely.normalize(shapely.Polygon(part.exterior, holes)).reverse()  # exterior counter-clockwise
+    part = shapely.Polygon(part.exterior, holes)
     rings = [shapely.get_coordinates(ring)[:-1] for ring in (part.exterior, *part.interiors)]
-    rings = [ring if _area(ring) > 0 == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
+    rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
     sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
@@ -142,6 +142,7 @@ def _as_seen(sides: list[Side], i: int, n: int) -> bool:
     side = sides[i]
     if side.raw:
         return False
+    globals()['RAW'] = globals().get('RAW',0)+1
     side.raw = True
     after = sides[(i + 1) % len(sides)]
     side.stop = side.start + ((after.start - side.start) % n or n)

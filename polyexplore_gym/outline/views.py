@@ -20,6 +20,8 @@ INSIDE = 0.1
 """A beam that goes through a wall ends there only so far from the wall's ends, m: they are not known better."""
 OBLIQUE = math.cos(math.radians(87.0))
 """A more oblique beam is not moved: along the beam the wall is far away."""
+CRACK = 0.02
+"""What is narrower between parts that were seen has been seen, m."""
 APART = 2.5
 """Between beams that are so many times as far apart as is usual in their scan nothing is known."""
 LEAST_RANGE = 1e-6
@@ -52,11 +54,18 @@ def views_of(scans: Iterable[Beams], max_range: float) -> Views:
         if angles.size < 3:
             continue
         step = np.diff(angles, append=angles[0] + 2.0 * math.pi)
+        usual = float(np.median(step))
+        gap = step > APART * usual
+        # A beam stands for half a step on either side: else views that meet leave a crack.
+        before, after = np.flatnonzero(np.roll(gap, 1)), np.flatnonzero(gap)
+        wide = np.concatenate((angles[before] - 0.5 * usual, angles, angles[after] + 0.5 * usual))
+        order = np.argsort(wide, kind="stable")
+        bearing = wide[order] + scan.pose[2]
+        ranges = np.concatenate((ranges[before], ranges, ranges[after]))[order]
         apexes.append(scan.pose[:2])
-        bearing = angles + scan.pose[2]
         points.append(scan.pose[:2] + ranges[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1))
         hits.append(ranges < max_range - 1e-9)
-        apart.append(step > APART * np.median(step))
+        apart.append(np.concatenate((np.zeros(len(before)), gap & False, np.ones(len(after))))[order] > 0)
     first = np.concatenate(([0], np.cumsum([len(some) for some in points])))
     if not apexes:
         return Views(np.zeros((0, 2)), first, np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(0, np.bool_))
@@ -168,4 +177,7 @@ def seen(
             joined.append(shapely.union_all(polygons))
             polygons = []
     joined.append(shapely.union_all(polygons))
-    return shapely.union_all(joined), np.concatenate(loose) if loose else np.zeros((0, 2))
+    area = shapely.union_all(joined)
+    for way in (CRACK, -CRACK):
+        area = shapely.buffer(area, 0.5 * way, join_style="mitre")
+    return area, np.concatenate(loose) if loose else np.zeros((0, 2))
