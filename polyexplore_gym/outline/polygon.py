@@ -21,24 +21,24 @@ def corners(sides: list[Side], ring: np.ndarray, reach: float) -> tuple[np.ndarr
     owner: list[int] = []
     for k, q in enumerate(sides):
         p = sides[k - 1]
-        if p.raw and q.raw:
+        if p.held and q.held:
             points.append(ring[q.start % n])
             owner.append(k)
         else:
             ends = ring[p.stop % n], ring[q.start % n]
-            corner = None if p.raw or q.raw else crossing(p, q)
+            corner = None if p.held or q.held else crossing(p, q)
             if corner is not None and min(math.hypot(*(corner - end)) for end in ends) <= reach:
                 points.append(corner)
                 owner.append(k)
             else:
-                a = ends[0] if p.raw else projected(ends[0], p)
-                b = ends[1] if q.raw else projected(ends[1], q)
+                a = ends[0] if p.held else projected(ends[0], p)
+                b = ends[1] if q.held else projected(ends[1], q)
                 if math.hypot(*(b - a)) > 1e-3:
                     points.append(a)
                     owner.append(-1)
                 points.append(b)
                 owner.append(k)
-        if q.raw:
+        if q.held == 2:
             between = ring[np.arange(q.start + 1, q.stop) % n]
             points += list(between)
             owner += [k] * len(between)

@@ -38,8 +38,8 @@ class Side:
     """Of the map; -1: none."""
     support: float
     """Length along which walls or returns stand for it, m."""
-    raw: bool = False
-    """Whether the boundary's own vertices are kept."""
+    held: int = 0
+    """1: it goes from and to the boundary's own vertices; 2: and by all of those between."""
 
 
 def labels(ring: np.ndarray, walls: Walls, tree: Any) -> np.ndarray:
@@ -127,6 +127,11 @@ def distance_to(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     length2 = max(float(along @ along), 1e-18)
     at = np.clip((points - a) @ along / length2, 0.0, 1.0)
     return np.hypot(*(points - a - at[:, None] * along).T)
+
+
+def _from_chain(point: np.ndarray, chain: np.ndarray) -> float:
+    """Distance of a point (2,) from a chain (n, 2), m."""
+    return min(float(distance_to(point[None], a, b)[0]) for a, b in zip(chain, chain[1:], strict=False))
 
 
 def _free(start: int, stop: int, a: np.ndarray, b: np.ndarray, loose: Any) -> Side:
@@ -236,7 +241,8 @@ def _without(
     off = np.minimum(distance_to(stretch, a, corner), distance_to(stretch, corner, b)).max()
     far = max(math.hypot(*(corner - a)), math.hypot(*(corner - b)))
     outside = (corner[0] - a[0]) * (b[1] - a[1]) - (corner[1] - a[1]) * (b[0] - a[0]) > 0  # right of a to b: unseen
-    if off <= tolerance and far <= reach:
+    sharp = float(_from_chain(corner, stretch)) > 1.5 * tolerance
+    if off <= tolerance and far <= reach and not (s.support > 0.0 and sharp):
         return p, q
     if s.support == 0.0 and outside and width <= reach and far <= reach:
         return p, q

@@ -140,10 +140,10 @@ def _beside(owner: np.ndarray, edge: int) -> list[int]:
 def _as_seen(sides: list[Side], i: int, n: int) -> bool:
     """Let a side be the boundary as it was seen, on to the next side; whether that changes anything."""
     side = sides[i]
-    if side.raw:
+    if side.held == 2:
         return False
     globals()['RAW'] = globals().get('RAW',0)+1
-    side.raw = True
+    side.held += 1
     after = sides[(i + 1) % len(sides)]
     side.stop = side.start + ((after.start - side.start) % n or n)
     return True

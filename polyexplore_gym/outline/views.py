@@ -178,6 +178,6 @@ def seen(
             polygons = []
     joined.append(shapely.union_all(polygons))
     area = shapely.union_all(joined)
-    for way in (CRACK, -CRACK):
+    for way in (CRACK, -2.0 * CRACK, CRACK):
         area = shapely.buffer(area, 0.5 * way, join_style="mitre")
     return area, np.concatenate(loose) if loose else np.zeros((0, 2))
