@@ -8,7 +8,7 @@ from polyexplore_gym.mapping.localize import Correction, Localizer
 from polyexplore_gym.mapping.log_map import LogMap, map_log, sensor_of
 from polyexplore_gym.mapping.logs import LaserLog, read_log
 from polyexplore_gym.mapping.polylines import ScanPolylines, extract_polylines
-from polyexplore_gym.mapping.walls import Walls, walls_of, walls_of_log
+from polyexplore_gym.mapping.walls import Walls, beams_of_log, walls_of, walls_of_log
 
 __all__ = [
     "MAP_SUFFIXES",
@@ -21,6 +21,7 @@ __all__ = [
     "ScanLines",
     "ScanPolylines",
     "Walls",
+    "beams_of_log",
     "extract_lines",
     "extract_polylines",
     "map_log",

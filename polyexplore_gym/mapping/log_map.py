@@ -45,6 +45,8 @@ class LogMap:
     """(K,) standard deviation across each segment, m."""
     fragments: np.ndarray
     """(F, 4) end points, m."""
+    used: np.ndarray
+    """(scans used,) which scans of the log."""
     path: np.ndarray
     """(scans used, 3) x, y (m), heading (rad) of the laser."""
     points: np.ndarray
@@ -201,6 +203,7 @@ def map_log(
         segment_line=segment_line,
         segment_sigma=line_map.sigma[rows][of][wall],
         fragments=parts[~wall],
+        used=np.array(used),
         path=poses[used],
         points=np.concatenate(points),
         point_scan=np.repeat(np.arange(len(points)), [len(some) for some in points]),

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.mapping.evidence import RATIO, Beams, held_against
+from polyexplore_gym.mapping.extract import check_scan
 from polyexplore_gym.mapping.line_map import LineMap
 from polyexplore_gym.mapping.log_map import LogMap
+from polyexplore_gym.mapping.logs import LaserLog, deskewed
 
 
 class Walls(NamedTuple):
@@ -41,3 +43,11 @@ def walls_of(line_map: LineMap, scans: Iterable[Beams], sensor: SensorConfig, ra
 def walls_of_log(made: LogMap) -> Walls:
     """The walls of a log's map, from which contradicted ones are gone already."""
     return Walls(made.segments, made.segment_line, made.rho, made.alpha, made.segment_sigma)
+
+
+def beams_of_log(log: LaserLog, made: LogMap) -> Iterator[Beams]:
+    """The scans that a log's map was made of, their poses taken as they are."""
+    straight = deskewed(log)
+    for k, pose in zip(made.used.tolist(), made.path, strict=True):
+        _, angles, ranges = check_scan(straight.angles[k], straight.ranges[k])
+        yield Beams(angles, ranges, pose, np.zeros((3, 3)))

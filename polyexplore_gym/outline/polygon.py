@@ -13,8 +13,8 @@ from polyexplore_gym.outline.sides import Side, crossing, projected
 def corners(sides: list[Side], ring: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """The corners (k, 2) of a ring, and the side (k,) that leads on from each; -1: a step between two sides.
 
-    Neighbours meet where their lines do. Where that is farther than `reach` (m) from where the boundary changes from one
-    to the other, and where they are parallel, each ends there, and a step leads from one to the other.
+    Neighbours meet where their lines do. Where that is farther than `reach` (m) from where the boundary changes from
+    one to the other, and where they are parallel, each ends there, and a step leads from one to the other.
     """
     n = len(ring)
     points: list[np.ndarray] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -84,7 +85,7 @@ def sides_of(ring: np.ndarray, label: np.ndarray, walls: Walls, loose: Any, tole
             continue
         stretch = ring[np.arange(a, b + 1) % n]
         cuts = _simplified(stretch, tolerance)
-        out += [_free(a + int(i), a + int(j), stretch[i], stretch[j], loose) for i, j in zip(cuts, cuts[1:], strict=False)]
+        out += [_free(a + int(i), a + int(j), stretch[i], stretch[j], loose) for i, j in itertools.pairwise(cuts)]
     return out
 
 
@@ -131,7 +132,7 @@ def distance_to(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _from_chain(point: np.ndarray, chain: np.ndarray) -> float:
     """Distance of a point (2,) from a chain (n, 2), m."""
-    return min(float(distance_to(point[None], a, b)[0]) for a, b in zip(chain, chain[1:], strict=False))
+    return min(float(distance_to(point[None], a, b)[0]) for a, b in itertools.pairwise(chain))
 
 
 def _free(start: int, stop: int, a: np.ndarray, b: np.ndarray, loose: Any) -> Side:
@@ -140,7 +141,9 @@ def _free(start: int, stop: int, a: np.ndarray, b: np.ndarray, loose: Any) -> Si
     length = max(float(np.hypot(*along)), 1e-12)
     direction = along / length
     side = Side(start, stop, (a + b) / 2, direction, -1, 0.0)
-    near = loose.query(shapely.linestrings([a, b]), predicate="dwithin", distance=CLEARANCE) if loose is not None else []
+    near = (
+        loose.query(shapely.linestrings([a, b]), predicate="dwithin", distance=CLEARANCE) if loose is not None else []
+    )
     if not len(near):
         return side
     points = shapely.get_coordinates(loose.geometries[near])
@@ -179,8 +182,8 @@ def projected(point: np.ndarray, side: Side) -> np.ndarray:
 def reduced(sides: list[Side], ring: np.ndarray, tolerance: float, reach: float) -> list[Side]:
     """The sides without those that nothing speaks for: their neighbours meet instead.
 
-    A side goes where the measured boundary deviates by no more than `tolerance` (m) from its neighbours, led on to where
-    they meet; and where it is open, no longer than `reach` (m), and they meet no farther away than that.
+    A side goes where the measured boundary deviates by no more than `tolerance` (m) from its neighbours, led on to
+    where they meet; and where it is open, no longer than `reach` (m), and they meet no farther away than that.
     """
     sides = list(sides)
     while True:
@@ -209,9 +212,7 @@ def reduced(sides: list[Side], ring: np.ndarray, tolerance: float, reach: float)
         sides = [side for k, side in enumerate(sides) if k not in gone]
 
 
-def _without(
-    p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reach: float
-) -> tuple[Side, ...] | None:
+def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reach: float) -> tuple[Side, ...] | None:
     """The neighbours p and q of a side s that goes: two, or one if they lie on one line; None if s has to stay."""
     n = len(ring)
     first, last = p.stop, q.start + n * math.ceil((p.stop - q.start) / n)

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numba import njit
 
+from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.mapping import Beams, Walls
 
 CLEARANCE = 0.05
@@ -145,15 +146,14 @@ def snap(
 def seen(
     views: Views,
     walls: Walls,
-    sigma_range: float,
-    sigma_angle: float,
+    sensor: SensorConfig,
     track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
 ) -> tuple[Any, np.ndarray]:
     """The area that the scans saw, up to the walls.
 
     Args:
         views, walls: what was seen, and the walls on which it ends.
-        sigma_range, sigma_angle: noise of the laser, m and rad.
+        sensor: its noise.
         track: wraps the scans, to show progress.
 
     Returns:
@@ -167,7 +167,7 @@ def seen(
         points, hits = views.points[part], views.hits[part]
         if len(points) < 3:
             continue
-        noise = sigma_range**2, sigma_angle**2
+        noise = sensor.sigma_range**2, sensor.sigma_angle**2
         ends, on = snap(walls.segments, walls.sigma, views.apexes[i], points, hits, *noise)
         loose.append(points[hits & (on < 0)])
         gaps = np.flatnonzero(views.apart[part]) + 1

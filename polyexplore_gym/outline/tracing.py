@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 
+from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.mapping import Walls
 from polyexplore_gym.outline.polygon import corners, crossings, straightened
@@ -39,7 +40,7 @@ class Outline(NamedTuple):
     perimeter: float
     """of all rings, m"""
     left_out: float
-    """area that was seen but is not connected to the place asked for, m2"""
+    """area that was seen but is not connected to the rest, m2"""
 
     @property
     def unknown_length(self) -> float:
@@ -55,31 +56,29 @@ class Outline(NamedTuple):
 def trace(
     views: Views,
     walls: Walls,
-    at: np.ndarray,
-    sigma_range: float,
-    sigma_angle: float,
+    sensor: SensorConfig,
     *,
     tolerance: float = TOLERANCE,
     track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
 ) -> Outline:
-    """The outline of what scans saw.
+    """The outline of what scans saw: of the part in which most of them were made.
 
     Args:
         views, walls: what was seen, and the walls that are left when all beams have been held against them.
-        at: (2,) a place in the part that is wanted, such as where the robot stands, m.
-        sigma_range, sigma_angle: noise of the laser, m and rad.
+        sensor: its noise.
         tolerance: greatest deviation of what was measured from a side that stands for it, m.
         track: wraps the scans, to show progress.
 
     Raises:
         InvalidFloorPlanError: nothing was seen.
     """
-    area, loose = seen(views, walls, sigma_range, sigma_angle, track)
+    area, loose = seen(views, walls, sensor, track)
     parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon" and part.area > 0.0]
     if not parts:
         raise InvalidFloorPlanError("no floor plan: the scans saw no area")
-    point = shapely.Point(at[:2])
-    part = min(parts, key=lambda p: (p.distance(point), -p.area))
+    places = shapely.points(views.apexes)
+    part = max(parts, key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
+    left_out = sum(p.area for p in parts) - part.area
     holes = [ring for ring in part.interiors if 2.0 * shapely.Polygon(ring).area > LEAST_HOLE * ring.length]
     part = shapely.Polygon(part.exterior, holes)
     rings = [shapely.get_coordinates(ring)[:-1] for ring in (part.exterior, *part.interiors)]
@@ -89,7 +88,7 @@ def trace(
     sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
     done = _polygon(rings, sides)
     known = [tree for tree in (wall_tree, loose_tree) if tree is not None]
-    return Outline(done[0], tuple(done[1:]), _unknown(done, known), _length(done), sum(p.area for p in parts) - part.area)
+    return Outline(done[0], tuple(done[1:]), _unknown(done, known), _length(done), left_out)
 
 
 def _area(ring: np.ndarray) -> float:
@@ -118,17 +117,15 @@ def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarra
         if not bad:
             return made
         again = False
-        for k, edge in bad:
-            some, owner = sides[k], int(owners[k][edge]) if edge < len(owners[k]) else -1
-            which = range(len(some)) if owner < 0 and edge < 0 else [owner] if owner >= 0 else _beside(owners[k], edge)
+        for k, edge in sorted(bad):
+            side = int(owners[k][edge]) if edge >= 0 else -1
+            which = [side] if side >= 0 else range(len(sides[k])) if edge < 0 else _beside(owners[k], edge)
             for i in which:
-                again |= _as_seen(some, i, len(rings[k]))
-        if not again:  # the boundary as it was seen is valid: unless all of a ring is meant
-            for k, _ in bad:
-                for i in range(len(sides[k])):
-                    again |= _as_seen(sides[k], i, len(rings[k]))
-        if not again:
-            raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
+                again |= _as_seen(sides[k], i, len(rings[k]))
+        if not again:  # all of it is as it was seen, but for vertices that are not needed
+            if not shapely.Polygon(rings[0], rings[1:]).is_valid:
+                raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
+            return rings
 
 
 def _beside(owner: np.ndarray, edge: int) -> list[int]:
@@ -142,7 +139,6 @@ def _as_seen(sides: list[Side], i: int, n: int) -> bool:
     side = sides[i]
     if side.held == 2:
         return False
-    globals()['RAW'] = globals().get('RAW',0)+1
     side.held += 1
     after = sides[(i + 1) % len(sides)]
     side.stop = side.start + ((after.start - side.start) % n or n)
