@@ -19,6 +19,8 @@ PARALLEL = math.sin(math.radians(8.0))
 """Sides that meet at a smaller angle, or a larger one than 180 degrees less this, have no corner of their own."""
 CRACK = 0.03
 """An opening that is narrower is noise, m."""
+LONGEST_RUN = 3
+"""So many sides in a row, of which nothing was seen, go together."""
 STEADY = 0.1
 """Returns tell the direction of a side only so well or better, rad; else it is that of the boundary."""
 
@@ -183,33 +185,63 @@ def reduced(sides: list[Side], ring: np.ndarray, tolerance: float, reach: float)
     """The sides without those that nothing speaks for: their neighbours meet instead.
 
     A side goes where the measured boundary deviates by no more than `tolerance` (m) from its neighbours, led on to
-    where they meet; and where it is open, no longer than `reach` (m), and they meet no farther away than that.
+    where they meet; and sides of which nothing was seen, up to `LONGEST_RUN` in a row, where no more than `reach` (m)
+    is closed by that. A side on no line of the map joins a neighbour from whose line it deviates no more.
     """
     sides = list(sides)
     while True:
         order = sorted(range(len(sides)), key=lambda k: (sides[k].support, sides[k].stop - sides[k].start))
         gone: set[int] = set()
         touched: set[int] = set()
+        m = len(sides)
         for k in order:
-            m = len(sides)
-            before, after = (k - 1) % m, (k + 1) % m
-            if m - len(gone) <= 3 or touched & {before, k, after}:
-                continue
-            joined = _without(sides[before], sides[k], sides[after], ring, tolerance, reach)
-            if joined is None:
-                continue
-            touched |= {before, k, after}
-            if len(joined) == 1 and before != after:
-                if m - len(gone) <= 4:
+            for run in range(1, LONGEST_RUN + 1):
+                some = [(k + i) % m for i in range(-1, run + 1)]
+                if m - len(gone) < run + 3 or touched.intersection(some):
+                    break
+                if run > 1 and any(sides[i].support > 0.0 for i in some[1:-1]):
+                    break
+                joined = _without(*(sides[i] for i in (some[0], k, some[-1])), ring, tolerance, reach)
+                if joined is None:
                     continue
-                sides[before] = joined[0]
-                gone |= {k, after}
-            else:
-                sides[before], sides[after] = joined
-                gone.add(k)
+                if len(joined) == 1:
+                    if m - len(gone) < run + 4:
+                        break
+                    gone.add(some[-1])
+                    sides[some[0]] = joined[0]
+                touched.update(some)
+                gone.update(some[1:-1])
+                break
+            if k not in touched:
+                for other in ((k - 1) % m, (k + 1) % m):
+                    if m - len(gone) > 3 and other not in touched and _joins(sides[k], sides[other], ring, tolerance):
+                        first, second = (other, k) if other == (k - 1) % m else (k, other)
+                        sides[other] = _led_on(sides[first], sides[second], sides[other], len(ring))
+                        touched.update((k, other))
+                        gone.add(k)
+                        break
         if not gone:
             return sides
         sides = [side for k, side in enumerate(sides) if k not in gone]
+
+
+def _joins(side: Side, lead: Side, ring: np.ndarray, tolerance: float) -> bool:
+    """Whether a side on no line of the map may as well run along the line of its neighbour."""
+    if side.line >= 0 or (side.support > lead.support and lead.line < 0) or side.direction @ lead.direction < 0.5:
+        return False
+    stretch = ring[np.arange(side.start, side.stop + 1) % len(ring)]
+    return bool(np.abs(_left_of(lead, stretch)).max() <= tolerance)
+
+
+def _left_of(side: Side, points: np.ndarray) -> np.ndarray:
+    """(n,) how far points (n, 2) lie on the left of a side's line, m."""
+    return (points - side.point) @ np.array([-side.direction[1], side.direction[0]])
+
+
+def _led_on(p: Side, q: Side, lead: Side, n: int) -> Side:
+    """One side from the beginning of p to the end of q, which follows it, along the line of one of them."""
+    stop = q.stop + n * math.ceil((p.stop - q.start) / n)
+    return Side(p.start, stop, lead.point, lead.direction, lead.line, p.support + q.support)
 
 
 def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reach: float) -> tuple[Side, ...] | None:
@@ -226,15 +258,13 @@ def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reac
         lead = p if (p.line >= 0, p.support) >= (q.line >= 0, q.support) else q
         other = q if lead is p else p
         ends = ring[[other.start % n, other.stop % n]]
-        off = np.abs((ends - lead.point) @ np.array([-lead.direction[1], lead.direction[0]]))
-        same = p.line == q.line >= 0
-        if not same and off.max() > tolerance:
+        if not p.line == q.line >= 0 and np.abs(_left_of(lead, ends)).max() > tolerance:
             return None
-        deviation = np.abs((stretch - lead.point) @ np.array([-lead.direction[1], lead.direction[0]])).max()
-        if deviation > tolerance and width > CRACK:
+        left = _left_of(lead, stretch)
+        closed = s.support == 0.0 and width <= reach and left.min() >= -tolerance
+        if np.abs(left).max() > tolerance and width > CRACK and not closed:
             return None
-        stop = q.stop + n * math.ceil((p.stop - q.start) / n)
-        return (Side(p.start, stop, lead.point, lead.direction, lead.line, p.support + q.support),)
+        return (_led_on(p, q, lead, n),)
     ahead = (corner - ring[p.start % n]) @ p.direction
     behind = (ring[q.stop % n] - corner) @ q.direction
     if ahead < 0 or behind < 0:
@@ -242,7 +272,7 @@ def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reac
     off = np.minimum(distance_to(stretch, a, corner), distance_to(stretch, corner, b)).max()
     far = max(math.hypot(*(corner - a)), math.hypot(*(corner - b)))
     outside = (corner[0] - a[0]) * (b[1] - a[1]) - (corner[1] - a[1]) * (b[0] - a[0]) > 0  # right of a to b: unseen
-    sharp = float(_from_chain(corner, stretch)) > 1.5 * tolerance
+    sharp = _from_chain(corner, stretch) > 1.5 * tolerance
     if off <= tolerance and far <= reach and not (s.support > 0.0 and sharp):
         return p, q
     if s.support == 0.0 and outside and width <= reach and far <= reach:
