@@ -17,6 +17,8 @@ ON_LINE = 1e-5
 """What was moved onto a line lies within this of it, m: rounding of the overlay."""
 PARALLEL = math.sin(math.radians(8.0))
 """Sides that meet at a smaller angle, or a larger one than 180 degrees less this, have no corner of their own."""
+PARALLEL_LINES = math.sin(math.radians(3.0))
+"""The same of two sides on lines of the map, whose directions are known better."""
 CRACK = 0.03
 """An opening that is narrower is noise, m."""
 LONGEST_RUN = 3
@@ -170,7 +172,7 @@ def _free(start: int, stop: int, a: np.ndarray, b: np.ndarray, loose: Any) -> Si
 def crossing(p: Side, q: Side) -> np.ndarray | None:
     """Where the lines of two sides meet, None if they are (nearly) parallel."""
     sine = p.direction[0] * q.direction[1] - p.direction[1] * q.direction[0]
-    if abs(sine) < PARALLEL:
+    if abs(sine) < (PARALLEL_LINES if p.line >= 0 and q.line >= 0 else PARALLEL):
         return None
     d = q.point - p.point
     return p.point + (d[0] * q.direction[1] - d[1] * q.direction[0]) / sine * p.direction
