@@ -21,6 +21,8 @@ PARALLEL_LINES = math.sin(math.radians(3.0))
 """The same of two sides on lines of the map, whose directions are known better."""
 CRACK = 0.03
 """An opening that is narrower is noise, m."""
+OPEN = 0.1
+"""Greatest deviation of a side of which nothing was seen, m."""
 LONGEST_RUN = 3
 """So many sides in a row, of which nothing was seen, go together."""
 STEADY = 0.1
@@ -232,7 +234,8 @@ def _joins(side: Side, lead: Side, ring: np.ndarray, tolerance: float) -> bool:
     if side.line >= 0 or (side.support > lead.support and lead.line < 0) or side.direction @ lead.direction < 0.5:
         return False
     stretch = ring[np.arange(side.start, side.stop + 1) % len(ring)]
-    return bool(np.abs(_left_of(lead, stretch)).max() <= tolerance)
+    allowed = OPEN if side.support == lead.support == 0.0 else tolerance
+    return bool(np.abs(_left_of(lead, stretch)).max() <= allowed)
 
 
 def _left_of(side: Side, points: np.ndarray) -> np.ndarray:
@@ -275,7 +278,7 @@ def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reac
     far = max(math.hypot(*(corner - a)), math.hypot(*(corner - b)))
     outside = (corner[0] - a[0]) * (b[1] - a[1]) - (corner[1] - a[1]) * (b[0] - a[0]) > 0  # right of a to b: unseen
     sharp = _from_chain(corner, stretch) > 1.5 * tolerance
-    if off <= tolerance and far <= reach and not (s.support > 0.0 and sharp):
+    if off <= (tolerance if s.support > 0.0 else OPEN) and far <= reach and not (s.support > 0.0 and sharp):
         return p, q
     if s.support == 0.0 and outside and width <= reach and far <= reach:
         return p, q

@@ -14,14 +14,15 @@ from polyexplore_gym.errors import InvalidFloorPlanError
 from polyexplore_gym.mapping import Walls
 from polyexplore_gym.outline.polygon import corners, crossings, straightened
 from polyexplore_gym.outline.sides import Side, labels, reduced, sides_of
-from polyexplore_gym.outline.views import Views, seen
+from polyexplore_gym.outline.views import CLEARANCE, Views, seen
 
-TOLERANCE = 0.04
+TOLERANCE = 0.03
 """Greatest deviation of what was measured from a side that stands for it, m."""
 REACH = 0.5
 """What nobody saw is closed by the walls on both sides where they meet within this, m."""
 LEAST_HOLE = 0.03
-"""Holes narrower than this (twice the area over the perimeter), m, are noise."""
+"""Holes narrower than this (twice the area over the perimeter), m, are noise; and holes without any return on their
+boundary are no obstacles unless a disc of the diameter `REACH` fits into them."""
 STEP = 0.05
 """Known and unknown boundary are told apart every so many metres."""
 NEAR = 0.1
@@ -79,16 +80,23 @@ def trace(
     places = shapely.points(views.apexes)
     part = max(parts, key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
     left_out = sum(p.area for p in parts) - part.area
-    holes = [ring for ring in part.interiors if 2.0 * shapely.Polygon(ring).area > LEAST_HOLE * ring.length]
-    part = shapely.Polygon(part.exterior, holes)
-    rings = [shapely.get_coordinates(ring)[:-1] for ring in (part.exterior, *part.interiors)]
-    rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
+    trees = [tree for tree in (wall_tree, loose_tree) if tree is not None]
+    holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees)]
+    rings = [shapely.get_coordinates(ring.exterior)[:-1] for ring in (shapely.Polygon(part.exterior), *holes)]
+    rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
     sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
     done = _polygon(rings, sides)
-    known = [tree for tree in (wall_tree, loose_tree) if tree is not None]
-    return Outline(done[0], tuple(done[1:]), _unknown(done, known), _length(done), left_out)
+    return Outline(done[0], tuple(done[1:]), _unknown(done, trees), _length(done), left_out)
+
+
+def _obstacle(hole: shapely.Polygon, trees: list[Any]) -> bool:
+    """Whether a hole in what was seen is more than noise, or floor in the shadow of things that no scan looked into."""
+    if 2.0 * hole.area <= LEAST_HOLE * hole.length:
+        return False
+    measured = any(len(tree.query(hole.exterior, predicate="dwithin", distance=CLEARANCE)) for tree in trees)
+    return measured or not hole.buffer(-0.5 * REACH).is_empty
 
 
 def _area(ring: np.ndarray) -> float:
