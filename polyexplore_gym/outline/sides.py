@@ -230,11 +230,12 @@ def reduced(sides: list[Side], ring: np.ndarray, tolerance: float, reach: float)
 
 
 def _joins(side: Side, lead: Side, ring: np.ndarray, tolerance: float) -> bool:
-    """Whether a side on no line of the map may as well run along the line of its neighbour."""
-    if side.line >= 0 or (side.support > lead.support and lead.line < 0) or side.direction @ lead.direction < 0.5:
+    """Whether a side may as well run along the line of its neighbour."""
+    if (side.line >= 0, side.support) > (lead.line >= 0, lead.support) or side.direction @ lead.direction < 0.5:
         return False
     stretch = ring[np.arange(side.start, side.stop + 1) % len(ring)]
-    allowed = OPEN if side.support == lead.support == 0.0 else tolerance
+    # Two lines of the map are two walls, unless they are one that was seen in two ways.
+    allowed = 0.5 * tolerance if side.line >= 0 else OPEN if lead.support == 0.0 else tolerance
     return bool(np.abs(_left_of(lead, stretch)).max() <= allowed)
 
 
