@@ -485,7 +485,7 @@ def linemap(options: Linemap) -> int:
         from polyexplore_gym.mapping import beams_of_log, walls_of_log
         from polyexplore_gym.outline import floor_plan, trace, views_of
 
-        views = views_of(beams_of_log(log, result), sensor.max_range)
+        views = views_of(beams_of_log(log, result, sensor.max_range), sensor.max_range)
         found = floor_plan(trace(views, walls_of_log(result), sensor, track=track), _stem(options.log))
         print(_floor_plan_text(found))
         _save_plan(found, options.plan)

@@ -45,9 +45,12 @@ def walls_of_log(made: LogMap) -> Walls:
     return Walls(made.segments, made.segment_line, made.rho, made.alpha, made.segment_sigma)
 
 
-def beams_of_log(log: LaserLog, made: LogMap) -> Iterator[Beams]:
-    """The scans that a log's map was made of, their poses taken as they are."""
+def beams_of_log(log: LaserLog, made: LogMap, max_range: float) -> Iterator[Beams]:
+    """The scans that a log's map was made of, their poses taken as they are.
+
+    Of beams without a return (max_range, m, or more) nothing is taken to be known: lasers miss dark walls and glass.
+    """
     straight = deskewed(log)
     for k, pose in zip(made.used.tolist(), made.path, strict=True):
         _, angles, ranges = check_scan(straight.angles[k], straight.ranges[k])
-        yield Beams(angles, ranges, pose, np.zeros((3, 3)))
+        yield Beams(angles, np.where(ranges < max_range, ranges, np.nan), pose, np.zeros((3, 3)))

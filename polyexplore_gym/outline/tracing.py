@@ -79,16 +79,41 @@ def trace(
         raise InvalidFloorPlanError("no floor plan: the scans saw no area")
     places = shapely.points(views.apexes)
     part = max(parts, key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
-    left_out = sum(p.area for p in parts) - part.area
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
     trees = [tree for tree in (wall_tree, loose_tree) if tree is not None]
+    for glimpse in _glimpses(part, trees):
+        part = part.difference(glimpse)
+    part = max(shapely.get_parts(part), key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
+    left_out = sum(p.area for p in parts) - part.area
     holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees)]
     rings = [shapely.get_coordinates(ring.exterior)[:-1] for ring in (shapely.Polygon(part.exterior), *holes)]
     rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
     sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
     done = _polygon(rings, sides)
     return Outline(done[0], tuple(done[1:]), _unknown(done, trees), _length(done), left_out)
+
+
+def _glimpses(area: shapely.Polygon, trees: list[Any]) -> list[shapely.Polygon]:
+    """Parts of the area, narrower than `REACH`, whose borders were not measured: what was seen through slits."""
+    wide = area.buffer(-0.5 * REACH).buffer(0.5 * REACH + 1e-3)
+    out = []
+    for part in shapely.get_parts(area.difference(wide)):
+        if part.geom_type != "Polygon" or part.length < 2.0 * REACH:
+            continue
+        points = shapely.points(shapely.get_coordinates(part.exterior.segmentize(STEP))[:-1])
+        border = points[~shapely.dwithin(wide, points, NEAR)]
+        if _open(border, trees).sum() > 0.5 * max(len(border), REACH / STEP):
+            out.append(part.buffer(1e-3))
+    return out
+
+
+def _open(points: np.ndarray, trees: list[Any]) -> np.ndarray:
+    """(n,) of points, those to which nothing that was measured lies near."""
+    out = np.ones(len(points), np.bool_)
+    for tree in trees:
+        out[tree.query(points, predicate="dwithin", distance=NEAR)[0]] = False
+    return out
 
 
 def _obstacle(hole: shapely.Polygon, trees: list[Any]) -> bool:
@@ -115,10 +140,12 @@ def _sides(ring: np.ndarray, walls: Walls, wall_tree: Any, loose_tree: Any, tole
 
 def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarray]:
     """Rings of a valid polygon: where sides cross, the boundary as it was seen takes their place."""
+    exact: set[int] = set()
     while True:
         made, owners = [], []
-        for ring, some in zip(rings, sides, strict=True):
-            points, owner = straightened(*corners(some, ring, REACH))
+        for k, (ring, some) in enumerate(zip(rings, sides, strict=True)):
+            points, owner = corners(some, ring, REACH)
+            points, owner = (points, owner) if k in exact else straightened(points, owner)
             made.append(points)
             owners.append(owner)
         bad = _faults(made)
@@ -130,10 +157,11 @@ def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarra
             which = [side] if side >= 0 else range(len(sides[k])) if edge < 0 else _beside(owners[k], edge)
             for i in which:
                 again |= _as_seen(sides[k], i, len(rings[k]))
-        if not again:  # all of it is as it was seen, but for vertices that are not needed
-            if not shapely.Polygon(rings[0], rings[1:]).is_valid:
+        if not again:
+            blamed = {k for k, _ in bad} - exact
+            if not blamed:
                 raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
-            return rings
+            exact |= blamed
 
 
 def _beside(owner: np.ndarray, edge: int) -> list[int]:
@@ -182,9 +210,6 @@ def _unknown(rings: list[np.ndarray], trees: list[Any]) -> np.ndarray:
             length = math.hypot(*(b - a))
             n = max(math.ceil(length / STEP), 1)
             points = shapely.points(a + (np.arange(n)[:, None] + 0.5) / n * (b - a))
-            open_ = np.ones(n, np.bool_)
-            for tree in trees:
-                open_[tree.query(points, predicate="dwithin", distance=NEAR)[0]] = False
-            edges = np.flatnonzero(np.diff(open_.astype(int), prepend=0, append=0)).reshape(-1, 2) / n
+            edges = np.flatnonzero(np.diff(_open(points, trees).astype(int), prepend=0, append=0)).reshape(-1, 2) / n
             out += [[*(a + s * (b - a)), *(a + t * (b - a))] for s, t in edges if (t - s) * length > 2 * STEP]
     return np.array(out).reshape(-1, 4)
