@@ -138,7 +138,10 @@ def distance_to(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _from_chain(point: np.ndarray, chain: np.ndarray) -> float:
     """Distance of a point (2,) from a chain (n, 2), m."""
-    return min(float(distance_to(point[None], a, b)[0]) for a, b in itertools.pairwise(chain))
+    along = np.diff(chain, axis=0)
+    at = ((point - chain[:-1]) * along).sum(1) / np.maximum((along**2).sum(1), 1e-18)
+    off = point - chain[:-1] - np.clip(at, 0.0, 1.0)[:, None] * along
+    return float(np.sqrt((off**2).sum(1).min()))
 
 
 def _free(start: int, stop: int, a: np.ndarray, b: np.ndarray, loose: Any) -> Side:
@@ -278,9 +281,7 @@ def _without(p: Side, s: Side, q: Side, ring: np.ndarray, tolerance: float, reac
     off = np.minimum(distance_to(stretch, a, corner), distance_to(stretch, corner, b)).max()
     far = max(math.hypot(*(corner - a)), math.hypot(*(corner - b)))
     outside = (corner[0] - a[0]) * (b[1] - a[1]) - (corner[1] - a[1]) * (b[0] - a[0]) > 0  # right of a to b: unseen
-    sharp = _from_chain(corner, stretch) > 1.5 * tolerance
-    if off <= (tolerance if s.support > 0.0 else OPEN) and far <= reach and not (s.support > 0.0 and sharp):
-        return p, q
-    if s.support == 0.0 and outside and width <= reach and far <= reach:
-        return p, q
-    return None
+    if s.support > 0.0:
+        near = off <= tolerance and far <= reach and _from_chain(corner, stretch) <= 1.5 * tolerance
+        return (p, q) if near else None
+    return (p, q) if far <= reach and (off <= OPEN or (outside and width <= reach)) else None

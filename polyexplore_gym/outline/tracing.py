@@ -82,10 +82,11 @@ def trace(
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
     trees = [tree for tree in (wall_tree, loose_tree) if tree is not None]
-    for glimpse in _glimpses(part, trees):
-        part = part.difference(glimpse)
-    part = max(shapely.get_parts(part), key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
-    left_out = sum(p.area for p in parts) - part.area
+    part = max(
+        shapely.get_parts(part.difference(_glimpses(part, trees))),
+        key=lambda p: (int(shapely.intersects(p, places).sum()), p.area),
+    )
+    left_out = max(sum(p.area for p in parts) - part.area, 0.0)
     holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees)]
     rings = [shapely.get_coordinates(ring.exterior)[:-1] for ring in (shapely.Polygon(part.exterior), *holes)]
     rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
@@ -94,9 +95,10 @@ def trace(
     return Outline(done[0], tuple(done[1:]), _unknown(done, trees), _length(done), left_out)
 
 
-def _glimpses(area: shapely.Polygon, trees: list[Any]) -> list[shapely.Polygon]:
+def _glimpses(area: shapely.Polygon, trees: list[Any]) -> Any:
     """Parts of the area, narrower than `REACH`, whose borders were not measured: what was seen through slits."""
     wide = area.buffer(-0.5 * REACH).buffer(0.5 * REACH + 1e-3)
+    shapely.prepare(wide)
     out = []
     for part in shapely.get_parts(area.difference(wide)):
         if part.geom_type != "Polygon" or part.length < 2.0 * REACH:
@@ -105,7 +107,7 @@ def _glimpses(area: shapely.Polygon, trees: list[Any]) -> list[shapely.Polygon]:
         border = points[~shapely.dwithin(wide, points, NEAR)]
         if _open(border, trees).sum() > 0.5 * max(len(border), REACH / STEP):
             out.append(part.buffer(1e-3))
-    return out
+    return shapely.union_all(out)
 
 
 def _open(points: np.ndarray, trees: list[Any]) -> np.ndarray:

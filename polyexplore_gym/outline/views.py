@@ -172,7 +172,8 @@ def seen(
         loose.append(points[hits & (on < 0)])
         gaps = np.flatnonzero(views.apart[part]) + 1
         ring = np.insert(ends, gaps, views.apexes[i], axis=0)
-        polygons.append(shapely.Polygon(ring).buffer(0))
+        polygon = shapely.Polygon(ring)
+        polygons.append(polygon if polygon.is_valid else polygon.buffer(0))
         if len(polygons) == BLOCK:
             joined.append(shapely.union_all(polygons))
             polygons = []
