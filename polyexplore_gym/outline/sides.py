@@ -13,8 +13,8 @@ import shapely
 from polyexplore_gym.mapping import Walls
 from polyexplore_gym.outline.views import CLEARANCE, SPARE
 
-ON_LINE = 1e-5
-"""What was moved onto a line lies within this of it, m: rounding of the overlay."""
+ON_LINE = 5e-4
+"""What was moved onto a line lies within this of it, m: closing cracks moves the boundary by a percent of their width."""
 PARALLEL = math.sin(math.radians(8.0))
 """Sides that meet at a smaller angle, or a larger one than 180 degrees less this, have no corner of their own."""
 PARALLEL_LINES = math.sin(math.radians(3.0))
@@ -60,11 +60,12 @@ def labels(ring: np.ndarray, walls: Walls, tree: Any) -> np.ndarray:
     line = walls.line[near]
     normal = np.stack([np.cos(walls.alpha[line]), np.sin(walls.alpha[line])], axis=1)
     rho = walls.rho[line]
-    on = np.abs((ring[edge] * normal).sum(1) - rho) < ON_LINE
-    on &= np.abs((after[edge] * normal).sum(1) - rho) < ON_LINE
+    off = np.maximum(np.abs((ring[edge] * normal).sum(1) - rho), np.abs((after[edge] * normal).sum(1) - rho))
+    on = off < ON_LINE
     along = walls.segments[near, 2:] - walls.segments[near, :2]
     on &= ((after[edge] - ring[edge]) * along).sum(1) >= 0.0
-    out[edge[on]] = line[on]
+    nearest_last = np.flatnonzero(on)[np.argsort(-off[on], kind="stable")]
+    out[edge[nearest_last]] = line[nearest_last]
     return out
 
 

@@ -82,10 +82,8 @@ def trace(
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
     trees = [tree for tree in (wall_tree, loose_tree) if tree is not None]
-    part = max(
-        shapely.get_parts(part.difference(_glimpses(part, trees))),
-        key=lambda p: (int(shapely.intersects(p, places).sum()), p.area),
-    )
+    wide = [p for p in shapely.get_parts(part.difference(_glimpses(part, trees))) if p.area > 0.0]
+    part = max(wide or [part], key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
     left_out = max(sum(p.area for p in parts) - part.area, 0.0)
     holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees)]
     rings = [shapely.get_coordinates(ring.exterior)[:-1] for ring in (shapely.Polygon(part.exterior), *holes)]

@@ -113,17 +113,19 @@ def test_what_is_seen_all_round_is_a_hole():
 
 def test_the_unknown_is_closed_and_marked():
     """One look along a corridor with a niche, most of which stays unknown."""
-    ring = [[0, 0], [8, 0], [8, 1.5], [5, 1.5], [5, 4], [4, 4], [4, 1.5], [0, 1.5]]
+    ring = [[0, 0], [5, 0], [5, 1.5], [4, 1.5], [4, 4], [3, 4], [3, 1.5], [0, 1.5]]
     outline = outlined(walls(ring), [(0.5, 0.75, 0.0)], sensor=HALF)
-    assert 0.2 < outline.unknown_length < 4.0
     assert outline.unknown_share == pytest.approx(outline.unknown_length / outline.perimeter)
-    # It lies where the niche begins, or behind the laser, which looks ahead, and nowhere else.
-    for line in outline.unknown.reshape(-1, 2, 2):
-        x, y = line.mean(axis=0)
-        assert (3.9 < x < 5.1 and y > 1.4) or x < 0.6
+    # What bounds the view: half a turn behind the laser, 1.5 m; and from one side of the niche to the other, where the
+    # ray past its nearer corner ends.
+    behind = outline.unknown[outline.unknown[:, [0, 2]].max(axis=1) < 0.6]
+    niche = outline.unknown[outline.unknown[:, [0, 2]].min(axis=1) > 2.9]
+    assert len(behind) + len(niche) == len(outline.unknown)
+    assert np.hypot(*(behind[:, 2:] - behind[:, :2]).T).sum() == pytest.approx(1.5, abs=0.25)
+    assert np.hypot(*(niche[:, 2:] - niche[:, :2]).T).sum() == pytest.approx(math.hypot(1.0, 0.3), abs=0.25)
     seen = area(outline)
     assert seen.difference(shapely.Polygon(ring).buffer(0.02)).area < 0.02
-    assert seen.area > 10.0
+    assert seen.area == pytest.approx(4.5 * 1.5 + 0.5 * 0.3, abs=0.1)
 
 
 def test_a_wall_that_is_seen_through_is_gone():
@@ -193,7 +195,7 @@ def test_a_floor_plan_is_saved_with_what_is_unknown(tmp_path):
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_any_scans_give_a_valid_plan(seed):
-    """Scans of garbage, walls of garbage: a valid plan that holds most of what it was made in, or a clear error."""
+    """Scans of garbage, walls of garbage: a valid plan."""
     rng = np.random.default_rng(seed)
     scans = []
     for _ in range(rng.integers(1, 6)):
@@ -209,11 +211,10 @@ def test_any_scans_give_a_valid_plan(seed):
     alpha = np.arctan2(ends[:, 0] - ends[:, 2], ends[:, 3] - ends[:, 1])
     rho = ends[:, 0] * np.cos(alpha) + ends[:, 1] * np.sin(alpha)
     some = Walls(ends, np.arange(m), rho, alpha, np.full(m, 0.01))
-    try:
-        outline = trace(views_of(scans, 3.0), some, HALF)
-    except InvalidFloorPlanError as error:
-        assert "the scans saw no area" in str(error)
+    views = views_of(scans, 3.0)
+    if not len(views.apexes):
         return
+    outline = trace(views, some, HALF)
     plan = floor_plan(outline, "garbage")  # checks what a plan must be
     assert plan.area == pytest.approx(area(outline).area)
 
@@ -296,15 +297,15 @@ def test_where_sides_meet():
 
 
 def test_beams_far_apart_leave_out_what_lies_between():
-    """Half a turn is seen of a full circle, with a gap of unknown beams in it."""
-    angles = np.radians(np.arange(-90.0, 91.0))
-    ranges = np.full(181, 2.0)
-    ranges[80:100] = np.nan
+    """A full turn with a gap of unknown beams in it."""
+    angles = np.radians(np.arange(-180.0, 180.0))
+    ranges = np.full(360, 2.0)
+    ranges[170:191] = np.nan
     views = views_of([Beams(angles, ranges, np.array([1.0, 0, 0]), np.zeros((3, 3)))], 8.0)
     none = Walls(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
     polygon = area(trace(views, none, HALF))
-    # 159 steps and half a step at each of four ends, of 1 degree.
-    assert polygon.area == pytest.approx(161 * math.radians(1) * 2.0**2 / 2, rel=0.02)
+    # 338 steps, and half a step at both ends, of 1 degree.
+    assert polygon.area == pytest.approx(339 * math.radians(1) * 2.0**2 / 2, rel=0.005)
     assert not polygon.contains(shapely.Point(2.0, 0.0))
     assert polygon.contains(shapely.Point(1.7, 1.2))
 
