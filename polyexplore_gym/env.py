@@ -484,6 +484,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """
         from polyexplore_gym.outline import floor_plan, trace, views_of
 
+        if self._world is None:
+            raise gymnasium.error.ResetNeeded("call reset() before floor_plan()")
         sensor, scans = self.config.sensor, self._exploration.scans
         poses = np.column_stack((scans.apexes, scans.headings))
         beams = [

@@ -14,7 +14,7 @@ from polyexplore_gym.mapping import Walls
 from polyexplore_gym.outline.views import CLEARANCE, SPARE
 
 ON_LINE = 5e-4
-"""What was moved onto a line lies within this of it, m: closing cracks moves the boundary by a percent of their width."""
+"""What was moved onto a line lies within this of it, m: closing cracks moves the boundary by 1 % of their width."""
 PARALLEL = math.sin(math.radians(8.0))
 """Sides that meet at a smaller angle, or a larger one than 180 degrees less this, have no corner of their own."""
 PARALLEL_LINES = math.sin(math.radians(3.0))
