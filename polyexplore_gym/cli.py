@@ -486,7 +486,8 @@ def linemap(options: Linemap) -> int:
         from polyexplore_gym.outline import floor_plan, trace, views_of
 
         views = views_of(beams_of_log(log, result, sensor.max_range), sensor.max_range)
-        found = floor_plan(trace(views, walls_of_log(result), sensor, track=track), _stem(options.log))
+        outline = trace(views, walls_of_log(result), sensor, door=options.door_width, track=track)
+        found = floor_plan(outline, _stem(options.log))
         print(_floor_plan_text(found))
         _save_plan(found, options.plan)
     return 0

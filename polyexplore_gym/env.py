@@ -493,7 +493,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             for points, pose, covariance in zip(scans.points, poses, self._covariances, strict=True)
         ]
         walls = walls_of(self._lines, beams, sensor)
-        return floor_plan(trace(views_of(beams, sensor.max_range), walls, sensor), name)
+        return floor_plan(trace(views_of(beams, sensor.max_range), walls, sensor, door=self._lines.door), name)
 
     def snapshot(self) -> Snapshot:
         """This moment as plain arrays, for `polyexplore_gym.rendering`."""

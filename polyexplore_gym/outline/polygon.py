@@ -70,12 +70,17 @@ def straightened(points: np.ndarray, owner: np.ndarray, least: float = 1e-3) -> 
 
 
 def crossings(rings: list[np.ndarray]) -> set[tuple[int, int]]:
-    """Ring and edge of all edges that meet another than their neighbours."""
+    """Ring and edge of all edges that meet another than their neighbours, or run back along one of these."""
     ring = np.repeat(np.arange(len(rings)), [len(r) for r in rings])
     edge = np.concatenate([np.arange(len(r)) for r in rings])
     size = np.array([len(r) for r in rings])[ring]
-    lines = shapely.linestrings(np.concatenate([np.stack([r, np.roll(r, -1, axis=0)], axis=1) for r in rings]))
+    ends = np.concatenate([np.stack([r, np.roll(r, -1, axis=0)], axis=1) for r in rings])
+    lines = shapely.linestrings(ends)
     i, j = shapely.STRtree(lines).query(lines, predicate="intersects")
-    apart = (ring[i] != ring[j]) | (((edge[i] - edge[j]) % size[i] > 1) & ((edge[j] - edge[i]) % size[i] > 1))
-    bad = np.unique(i[apart])
+    ahead = (edge[j] - edge[i]) % size[i]
+    apart = (ring[i] != ring[j]) | ((ahead > 1) & (size[i] - ahead > 1))
+    u, v = ends[i, 1] - ends[i, 0], ends[j, 1] - ends[j, 0]
+    fold = (ring[i] == ring[j]) & (ahead == 1) & ((u * v).sum(1) < 0.0)
+    fold &= np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) <= 1e-9 * np.hypot(*u.T) * np.hypot(*v.T)
+    bad = np.unique(np.concatenate((i[apart], i[fold], j[fold])))
     return {(int(ring[k]), int(edge[k])) for k in bad}

@@ -209,7 +209,7 @@ def reduced(sides: list[Side], ring: np.ndarray, tolerance: float, reach: float)
                     break
                 if run > 1 and any(sides[i].support > 0.0 for i in some[1:-1]):
                     break
-                joined = _without(*(sides[i] for i in (some[0], k, some[-1])), ring, tolerance, reach)
+                joined = _without(sides[some[0]], sides[k], sides[some[-1]], ring, tolerance, reach)
                 if joined is None:
                     continue
                 if len(joined) == 1:

@@ -18,11 +18,11 @@ from polyexplore_gym.outline.views import CLEARANCE, Views, seen
 
 TOLERANCE = 0.03
 """Greatest deviation of what was measured from a side that stands for it, m."""
-REACH = 0.5
-"""What nobody saw is closed by the walls on both sides where they meet within this, m."""
+DOOR = 0.5
+"""Nobody goes through what is narrower, m: what nobody saw is closed there by the walls on both sides."""
 LEAST_HOLE = 0.03
 """Holes narrower than this (twice the area over the perimeter), m, are noise; and holes without any return on their
-boundary are no obstacles unless a disc of the diameter `REACH` fits into them."""
+boundary are no obstacles unless a disc of a door's width fits into them."""
 STEP = 0.05
 """Known and unknown boundary are told apart every so many metres."""
 NEAR = 0.1
@@ -59,6 +59,7 @@ def trace(
     walls: Walls,
     sensor: SensorConfig,
     *,
+    door: float = DOOR,
     tolerance: float = TOLERANCE,
     track: Callable[[Iterable[int], str], Iterable[int]] = lambda scans, what: scans,
 ) -> Outline:
@@ -67,6 +68,7 @@ def trace(
     Args:
         views, walls: what was seen, and the walls that are left when all beams have been held against them.
         sensor: its noise.
+        door: width of a door, m, such as the robot's diameter: what is narrower is no passage.
         tolerance: greatest deviation of what was measured from a side that stands for it, m.
         track: wraps the scans, to show progress.
 
@@ -82,28 +84,31 @@ def trace(
     wall_tree = _tree(walls.segments.reshape(-1, 2, 2), shapely.linestrings)
     loose_tree = _tree(loose, shapely.points)
     trees = [tree for tree in (wall_tree, loose_tree) if tree is not None]
-    wide = [p for p in shapely.get_parts(part.difference(_glimpses(part, trees))) if p.area > 0.0]
+    wide = [p for p in shapely.get_parts(part.difference(_glimpses(part, trees, door))) if p.area > 0.0]
     part = max(wide or [part], key=lambda p: (int(shapely.intersects(p, places).sum()), p.area))
     left_out = max(sum(p.area for p in parts) - part.area, 0.0)
-    holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees)]
+    holes = [ring for ring in map(shapely.Polygon, part.interiors) if _obstacle(ring, trees, door)]
     rings = [shapely.get_coordinates(ring.exterior)[:-1] for ring in (shapely.Polygon(part.exterior), *holes)]
     rings = [ring if (_area(ring) > 0) == (k == 0) else ring[::-1] for k, ring in enumerate(rings)]
-    sides = [_sides(ring, walls, wall_tree, loose_tree, tolerance) for ring in rings]
-    done = _polygon(rings, sides)
+    sides = [
+        reduced(sides_of(ring, labels(ring, walls, wall_tree), walls, loose_tree, tolerance), ring, tolerance, door)
+        for ring in rings
+    ]
+    done = _polygon(rings, sides, door)
     return Outline(done[0], tuple(done[1:]), _unknown(done, trees), _length(done), left_out)
 
 
-def _glimpses(area: shapely.Polygon, trees: list[Any]) -> Any:
-    """Parts of the area, narrower than `REACH`, whose borders were not measured: what was seen through slits."""
-    wide = area.buffer(-0.5 * REACH).buffer(0.5 * REACH + 1e-3)
+def _glimpses(area: shapely.Polygon, trees: list[Any], door: float) -> Any:
+    """Parts of the area, narrower than a door, whose borders were not measured: what was seen through slits."""
+    wide = area.buffer(-0.5 * door).buffer(0.5 * door + 1e-3)
     shapely.prepare(wide)
     out = []
     for part in shapely.get_parts(area.difference(wide)):
-        if part.geom_type != "Polygon" or part.length < 2.0 * REACH:
+        if part.geom_type != "Polygon" or part.length < 2.0 * door:
             continue
         points = shapely.points(shapely.get_coordinates(part.exterior.segmentize(STEP))[:-1])
         border = points[~shapely.dwithin(wide, points, NEAR)]
-        if _open(border, trees).sum() > 0.5 * max(len(border), REACH / STEP):
+        if _open(border, trees).sum() > 0.5 * max(len(border), door / STEP):
             out.append(part.buffer(1e-3))
     return shapely.union_all(out)
 
@@ -116,12 +121,12 @@ def _open(points: np.ndarray, trees: list[Any]) -> np.ndarray:
     return out
 
 
-def _obstacle(hole: shapely.Polygon, trees: list[Any]) -> bool:
+def _obstacle(hole: shapely.Polygon, trees: list[Any], door: float) -> bool:
     """Whether a hole in what was seen is more than noise, or floor in the shadow of things that no scan looked into."""
     if 2.0 * hole.area <= LEAST_HOLE * hole.length:
         return False
     measured = any(len(tree.query(hole.exterior, predicate="dwithin", distance=CLEARANCE)) for tree in trees)
-    return measured or not hole.buffer(-0.5 * REACH).is_empty
+    return measured or not hole.buffer(-0.5 * door).is_empty
 
 
 def _area(ring: np.ndarray) -> float:
@@ -133,18 +138,13 @@ def _tree(points: np.ndarray, shape: Any) -> Any:
     return shapely.STRtree(shape(points)) if len(points) else None
 
 
-def _sides(ring: np.ndarray, walls: Walls, wall_tree: Any, loose_tree: Any, tolerance: float) -> list[Side]:
-    sides = sides_of(ring, labels(ring, walls, wall_tree), walls, loose_tree, tolerance)
-    return reduced(sides, ring, tolerance, REACH)
-
-
-def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarray]:
+def _polygon(rings: list[np.ndarray], sides: list[list[Side]], door: float) -> list[np.ndarray]:
     """Rings of a valid polygon: where sides cross, the boundary as it was seen takes their place."""
     exact: set[int] = set()
     while True:
         made, owners = [], []
         for k, (ring, some) in enumerate(zip(rings, sides, strict=True)):
-            points, owner = corners(some, ring, REACH)
+            points, owner = corners(some, ring, door)
             points, owner = (points, owner) if k in exact else straightened(points, owner)
             made.append(points)
             owners.append(owner)
@@ -159,8 +159,10 @@ def _polygon(rings: list[np.ndarray], sides: list[list[Side]]) -> list[np.ndarra
                 again |= _as_seen(sides[k], i, len(rings[k]))
         if not again:
             blamed = {k for k, _ in bad} - exact
-            if not blamed:
+            if not blamed and not shapely.Polygon(made[0], made[1:]).is_valid:
                 raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
+            if not blamed:  # rings that touch in a point
+                return made
             exact |= blamed
 
 
@@ -194,7 +196,8 @@ def _faults(rings: list[np.ndarray]) -> set[tuple[int, int]]:
         if not outer.covers(shapely.Polygon(ring)):
             bad.add((k, -1))
     if not bad and not shapely.Polygon(rings[0], rings[1:]).is_valid:
-        bad = {(k, -1) for k in range(len(rings))}
+        own = {(k, -1) for k, ring in enumerate(rings) if not shapely.Polygon(ring).is_valid}
+        bad = own or {(k, -1) for k in range(len(rings))}
     return bad
 
 
@@ -203,7 +206,7 @@ def _length(rings: list[np.ndarray]) -> float:
 
 
 def _unknown(rings: list[np.ndarray], trees: list[Any]) -> np.ndarray:
-    """(U, 4) stretches of the rings, m, longer than twice `NEAR`, to which nothing that was measured lies near."""
+    """(U, 4) stretches of the rings, m, longer than two steps, to which nothing that was measured lies near."""
     out = []
     for ring in rings:
         for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):

@@ -42,13 +42,15 @@ class Views(NamedTuple):
     """(B, 2) where the beams end, of a scan in the order of their bearings"""
     hits: np.ndarray
     """(B,) whether there was a return"""
+    noise: np.ndarray
+    """(S, 2) variance of each scan's place, m2, and heading, rad2"""
     apart: np.ndarray
     """(B,) whether nothing is known between a beam and the next one of its scan, or the first after the last"""
 
 
 def views_of(scans: Iterable[Beams], max_range: float) -> Views:
     """The scans in the map frame; beams of which nothing is known are left out, and with them what lies about them."""
-    apexes, points, hits, apart = [], [], [], []
+    apexes, points, hits, apart, noise = [], [], [], [], []
     for scan in scans:
         known = (scan.ranges >= LEAST_RANGE) & np.isfinite(scan.angles)
         angles, ranges = scan.angles[known], np.minimum(scan.ranges[known], max_range)
@@ -64,13 +66,16 @@ def views_of(scans: Iterable[Beams], max_range: float) -> Views:
         bearing = wide[order] + scan.pose[2]
         ranges = np.concatenate((ranges[before], ranges, ranges[after]))[order]
         apexes.append(scan.pose[:2])
+        noise.append((0.5 * (scan.covariance[0, 0] + scan.covariance[1, 1]), scan.covariance[2, 2]))
         points.append(scan.pose[:2] + ranges[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1))
         hits.append(ranges < max_range - 1e-9)
         apart.append(np.concatenate((np.zeros(len(before)), gap & False, np.ones(len(after))))[order] > 0)
     first = np.concatenate(([0], np.cumsum([len(some) for some in points])))
     if not apexes:
-        return Views(np.zeros((0, 2)), first, np.zeros((0, 2)), np.zeros(0, np.bool_), np.zeros(0, np.bool_))
-    return Views(np.array(apexes), first, np.concatenate(points), np.concatenate(hits), np.concatenate(apart))
+        none = np.zeros(0, np.bool_)
+        return Views(np.zeros((0, 2)), first, np.zeros((0, 2)), none, np.zeros((0, 2)), none)
+    together = np.concatenate(points), np.concatenate(hits), np.array(noise), np.concatenate(apart)
+    return Views(np.array(apexes), first, *together)
 
 
 @njit(cache=True)
@@ -86,7 +91,8 @@ def snap(
     """The beams of one scan, those that end on a wall or behind it moved along the beam to where they meet it.
 
     Args:
-        segments, sigma: (K, 4) and (K,) of `Walls`.
+        segments: (K, 4) of `Walls`.
+        sigma: (K,) standard deviation of the scan's place across each, m.
         apex: (2,) of the scan, m.
         points, hits: (b, 2) and (b,) of its beams, by bearing.
         var_range, var_angle: of the noise, m2 and rad2.
@@ -167,8 +173,9 @@ def seen(
         points, hits = views.points[part], views.hits[part]
         if len(points) < 3:
             continue
-        noise = sensor.sigma_range**2, sensor.sigma_angle**2
-        ends, on = snap(walls.segments, walls.sigma, views.apexes[i], points, hits, *noise)
+        noise = sensor.sigma_range**2, sensor.sigma_angle**2 + views.noise[i, 1]
+        across = np.sqrt(walls.sigma**2 + views.noise[i, 0])
+        ends, on = snap(walls.segments, across, views.apexes[i], points, hits, *noise)
         loose.append(points[hits & (on < 0)])
         gaps = np.flatnonzero(views.apart[part]) + 1
         ring = np.insert(ends, gaps, views.apexes[i], axis=0)
