@@ -69,8 +69,9 @@ def straightened(points: np.ndarray, owner: np.ndarray, least: float = 1e-3) -> 
     return points, owner
 
 
-def crossings(rings: list[np.ndarray]) -> set[tuple[int, int]]:
-    """Ring and edge of all edges that meet another than their neighbours, or run back along one of these."""
+def crossings(rings: list[np.ndarray]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Pairs of edges, each by its ring and number, that meet without being neighbours, or where one runs back along
+    the other."""
     ring = np.repeat(np.arange(len(rings)), [len(r) for r in rings])
     edge = np.concatenate([np.arange(len(r)) for r in rings])
     size = np.array([len(r) for r in rings])[ring]
@@ -78,9 +79,9 @@ def crossings(rings: list[np.ndarray]) -> set[tuple[int, int]]:
     lines = shapely.linestrings(ends)
     i, j = shapely.STRtree(lines).query(lines, predicate="intersects")
     ahead = (edge[j] - edge[i]) % size[i]
-    apart = (ring[i] != ring[j]) | ((ahead > 1) & (size[i] - ahead > 1))
+    apart = (i < j) & ((ring[i] != ring[j]) | ((ahead > 1) & (size[i] - ahead > 1)))
     u, v = ends[i, 1] - ends[i, 0], ends[j, 1] - ends[j, 0]
     fold = (ring[i] == ring[j]) & (ahead == 1) & ((u * v).sum(1) < 0.0)
     fold &= np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) <= 1e-9 * np.hypot(*u.T) * np.hypot(*v.T)
-    bad = np.unique(np.concatenate((i[apart], i[fold], j[fold])))
-    return {(int(ring[k]), int(edge[k])) for k in bad}
+    pairs = np.stack((i, j), axis=1)[apart | fold]
+    return sorted(((int(ring[a]), int(edge[a])), (int(ring[b]), int(edge[b]))) for a, b in pairs)

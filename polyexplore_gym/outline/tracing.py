@@ -151,19 +151,33 @@ def _polygon(rings: list[np.ndarray], sides: list[list[Side]], door: float) -> l
         bad = _faults(made)
         if not bad:
             return made
-        again = False
-        for k, edge in sorted(bad):
-            side = int(owners[k][edge]) if edge >= 0 else -1
-            which = [side] if side >= 0 else range(len(sides[k])) if edge < 0 else _beside(owners[k], edge)
-            for i in which:
-                again |= _as_seen(sides[k], i, len(rings[k]))
+        again, blamed = False, set()
+        for edges in bad:
+            blamed |= {k for k, _ in edges}
+            again |= _give_way(edges, sides, owners, rings)
         if not again:
-            blamed = {k for k, _ in bad} - exact
-            if not blamed and not shapely.Polygon(made[0], made[1:]).is_valid:
-                raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
-            if not blamed:  # rings that touch in a point
+            if not blamed <= exact:
+                exact |= blamed
+            elif shapely.Polygon(made[0], made[1:]).is_valid:  # rings that touch in a point
                 return made
-            exact |= blamed
+            else:
+                raise InvalidFloorPlanError("no floor plan: what was seen has no valid outline")
+
+
+def _give_way(
+    edges: tuple[tuple[int, int], ...], sides: list[list[Side]], owners: list[np.ndarray], rings: list[np.ndarray]
+) -> bool:
+    """Let the side of which least was measured be as it was seen, of those to which some edges belong that do not go
+    together; edge -1: all sides of a ring. Whether that changes anything."""
+    some: list[tuple[int, int]] = []
+    for k, edge in edges:
+        if edge < 0:
+            changed = [_as_seen(sides[k], i, len(rings[k])) for i in range(len(sides[k]))]
+            return any(changed)
+        owner = int(owners[k][edge])
+        some += [(k, i) for i in ([owner] if owner >= 0 else _beside(owners[k], edge))]
+    some.sort(key=lambda at: (sides[at[0]][at[1]].line >= 0, sides[at[0]][at[1]].support))
+    return any(_as_seen(sides[k], i, len(rings[k])) for k, i in some)
 
 
 def _beside(owner: np.ndarray, edge: int) -> list[int]:
@@ -183,22 +197,20 @@ def _as_seen(sides: list[Side], i: int, n: int) -> bool:
     return True
 
 
-def _faults(rings: list[np.ndarray]) -> set[tuple[int, int]]:
-    """Ring and edge of what makes a polygon invalid; edge -1: all of a ring."""
-    bad = {(k, -1) for k, ring in enumerate(rings) if len(ring) < 3 or (_area(ring) > 0) != (k == 0)}
-    if bad:
-        return bad
+def _faults(rings: list[np.ndarray]) -> list[tuple[tuple[int, int], ...]]:
+    """What makes a polygon invalid: edges that do not go together, each by its ring and number; -1: all of a ring."""
+    whole = [((k, -1),) for k, ring in enumerate(rings) if len(ring) < 3 or (_area(ring) > 0) != (k == 0)]
+    if whole:
+        return list(whole)
     bad = crossings(rings)
     if bad:
-        return bad
+        return list(bad)
     outer = shapely.Polygon(rings[0])
-    for k, ring in enumerate(rings[1:], 1):
-        if not outer.covers(shapely.Polygon(ring)):
-            bad.add((k, -1))
-    if not bad and not shapely.Polygon(rings[0], rings[1:]).is_valid:
-        own = {(k, -1) for k, ring in enumerate(rings) if not shapely.Polygon(ring).is_valid}
-        bad = own or {(k, -1) for k in range(len(rings))}
-    return bad
+    whole = [((k, -1),) for k, ring in enumerate(rings) if k and not outer.covers(shapely.Polygon(ring))]
+    if not whole and not shapely.Polygon(rings[0], rings[1:]).is_valid:
+        whole = [((k, -1),) for k, ring in enumerate(rings) if not shapely.Polygon(ring).is_valid]
+        whole = whole or [((k, -1),) for k in range(len(rings))]
+    return list(whole)
 
 
 def _length(rings: list[np.ndarray]) -> float:
