@@ -68,7 +68,7 @@ def trace(
     The union of the scans' polygons, whose beams end on the walls of the map, says what is joined with what. Its
     boundary is cut into sides, each on a line of the map or, elsewhere, along the returns; sides that nothing speaks
     for go, and neighbours meet where their lines do. Where such sides would cross, that of which less was measured
-    follows the boundary instead, so that the polygon is valid. What nobody saw is closed by straight sides, and told of.
+    follows the boundary instead, so that the polygon is valid. What nobody saw is closed by straight sides and told of.
 
     Args:
         views, walls: what was seen, and the walls that are left when all beams have been held against them.
