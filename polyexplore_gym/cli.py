@@ -236,6 +236,9 @@ class Linemap:
     out: tuple[Path, ...] = (Path("results/linemap"),)
     """Files to write, .json, .geojson, .svg, .png or .yaml (for ROS map_server, with a .pgm), or folders, which get
     one of each, named after the log."""
+    plan: tuple[Path, ...] = ()
+    """Files for the floor plan: one valid polygon of the map's lines that the environment explores; .json, .geojson,
+    .dxf, .svg or .yaml (for ROS map_server, with a .pgm)."""
     max_range: float | None = None
     """Range from which on a beam has no return, m (default: what the log says, else 30)."""
     sigma_range: float = 0.01
@@ -415,23 +418,12 @@ def run(options: Run) -> int:
 
 def plan(options: Plan) -> int:
     """Read a plan and write it."""
-    from polyexplore_gym.floorplan import PLAN_SUFFIXES, save_plan
-
-    for path in options.out:
-        if path.suffix.lower() not in PLAN_SUFFIXES:
-            raise InvalidConfigError(f"{path}: the name must end in {', '.join(PLAN_SUFFIXES)}")
-        if not path.parent.is_dir():
-            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+    _check_plan_files(options.out)
     found = _plan(options.plan, options.radius, options.start, options.reading)
     x0, y0, x1, y1 = found.bounds
     print(f"{found.name}: {found.area:.1f} m2, {x1 - x0:.2f} x {y1 - y0:.2f} m, {found.n_vertices} vertices, "
           f"{len(found.holes)} holes")  # fmt: skip
-    for path in options.out:
-        try:
-            save_plan(found, path, resolution=options.resolution)
-        except OSError as error:
-            raise InvalidConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
-        print(f"written: {path}")
+    _save_plan(found, options.out, options.resolution)
     return 0
 
 
@@ -447,6 +439,7 @@ def linemap(options: Linemap) -> int:
     if options.trajectory is not None and not options.trajectory.parent.is_dir():
         raise InvalidConfigError(f"{options.trajectory}: the folder {options.trajectory.parent} does not exist")
     files = _map_files(options)
+    _check_plan_files(options.plan)
     fov = options.field_of_view
     if fov is not None and not 0 < fov <= 360:
         raise InvalidConfigError(f"--field-of-view {fov}: must lie in (0, 360]")
@@ -509,6 +502,15 @@ def linemap(options: Linemap) -> int:
     if options.trajectory is not None and poses is not None:
         save_trajectory(poses, options.trajectory)
         print(f"written: {options.trajectory}")
+    if options.plan:
+        from polyexplore_gym.mapping import beams_of_log, walls_of_log
+        from polyexplore_gym.outline import floor_plan, trace, views_of
+
+        views = views_of(beams_of_log(log, result, sensor.max_range), sensor.max_range)
+        outline = trace(views, walls_of_log(result), sensor, door=options.door_width, track=track)
+        found = floor_plan(outline, _stem(options.log))
+        print(_floor_plan_text(found))
+        _save_plan(found, options.plan)
     state.unlink(missing_ok=True)
     return 0
 
@@ -764,6 +766,40 @@ def _map_files(options: Linemap) -> list[Path]:
             require("matplotlib", "plots")
         files.append(path)
     return files
+
+
+def _check_plan_files(paths: Iterable[Path]) -> None:
+    """Reject what a floor plan cannot be written to, before the work and not after it."""
+    from polyexplore_gym.floorplan import PLAN_SUFFIXES
+    from polyexplore_gym.optional import require
+
+    for path in paths:
+        if path.suffix.lower() not in PLAN_SUFFIXES:
+            raise InvalidConfigError(f"{path}: the name must end in {', '.join(PLAN_SUFFIXES)}")
+        if not path.parent.is_dir():
+            raise InvalidConfigError(f"{path}: the folder {path.parent} does not exist")
+        if path.suffix.lower() == ".dxf":
+            require("ezdxf", "drawings")
+
+
+def _save_plan(plan: FloorPlan, paths: Iterable[Path], resolution: float = 0.05) -> None:
+    from polyexplore_gym.floorplan import save_plan
+
+    for path in paths:
+        try:
+            save_plan(plan, path, resolution=resolution)
+        except OSError as error:
+            raise InvalidConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+        print(f"written: {path}")
+
+
+def _floor_plan_text(plan: FloorPlan) -> str:
+    meta = plan.meta
+    return (
+        f"  floor plan    {plan.area:.1f} m2, {plan.n_vertices} vertices, {len(plan.holes)} holes; unknown: "
+        f"{meta['unknown_length']:.1f} m of the walls ({100 * meta['unknown_share']:.1f} %) in {len(meta['unknown'])} "
+        f"places; seen but not connected: {meta['left_out']:.1f} m2"
+    )
 
 
 def _linemap_text(name: str, log: LaserLog, made: LogMap) -> str:

@@ -18,7 +18,7 @@ from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, Inval
 from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.floorplan import FloorPlan, Suite, list_suites, load_plan
 from polyexplore_gym.floorplan import suite as suite_named
-from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
+from polyexplore_gym.mapping import Beams, Correction, LineMap, Localizer, ScanLines, extract_lines, walls_of
 from polyexplore_gym.rewards import StepOutcome, rewards
 from polyexplore_gym.scan import Scan
 from polyexplore_gym.sim.coverage import Coverage, grid_points, grid_spacing
@@ -144,6 +144,7 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._completed = False
         self._trajectory = [self._world.pose[None]]
         self._measured_at: list[np.ndarray] = []
+        self._covariances: list[np.ndarray] = []
         self._felt: float | None = None
         self._target, self._ended, self._parts = -1, "start", 0
         self._path = self._pose_model.estimate[None, :2]
@@ -389,6 +390,8 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             target=target,
             arrived=arrived,
         )
+        if len(self._covariances) < self._exploration.n_scans:  # else the scan showed nothing new and is not kept
+            self._covariances.append(fix.relative)
         self._coverage.add(self._world.segments, pose, self.config.sensor)
         self._measurements += 1
         self._scan = scan
@@ -469,6 +472,28 @@ class PolyExploreEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         """(3,) where the robot really is: for scores and pictures, not for policies."""
         assert self._world is not None
         return self._world.pose
+
+    def floor_plan(self, name: str = "explored") -> FloorPlan:
+        """What was explored so far as one valid floor plan, in the map frame: `save_plan` writes it.
+
+        What is unknown is closed; `meta` has the stretches of the walls that nobody saw (`unknown`, each x1, y1, x2,
+        y2 in m), their length (`unknown_length`, m) and share of all walls (`unknown_share`).
+
+        Raises:
+            InvalidFloorPlanError: what was seen is no floor.
+        """
+        from polyexplore_gym.outline import floor_plan, trace, views_of
+
+        if self._world is None:
+            raise gymnasium.error.ResetNeeded("call reset() before floor_plan()")
+        sensor, scans = self.config.sensor, self._exploration.scans
+        poses = np.column_stack((scans.apexes, scans.headings))
+        beams = [
+            Beams(scans.angles, np.hypot(*points.T), pose, covariance)
+            for points, pose, covariance in zip(scans.points, poses, self._covariances, strict=True)
+        ]
+        walls = walls_of(self._lines, beams, sensor)
+        return floor_plan(trace(views_of(beams, sensor.max_range), walls, sensor, door=self._lines.door), name)
 
     def snapshot(self) -> Snapshot:
         """This moment as plain arrays, for `polyexplore_gym.rendering`."""

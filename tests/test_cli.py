@@ -10,7 +10,7 @@ import pytest
 
 from polyexplore_gym.cli import BENCH_PLANS, COMPARED, LOOK_AHEAD, SCRIPTED, main
 from polyexplore_gym.evaluation import read_manifest, read_records
-from polyexplore_gym.floorplan import FloorPlan, save_plan
+from polyexplore_gym.floorplan import FloorPlan, load_plan, save_plan
 
 ROOMS = [[0, 0], [9, 0], [9, 4], [5, 4], [5, 6], [9, 6], [9, 9], [0, 9], [0, 5], [3, 5], [3, 4], [0, 4]]
 
@@ -312,6 +312,27 @@ def test_a_log_becomes_a_map(tmp_path, capsys):
     fewer = json.loads((tmp_path / "c.json").read_text())
     assert fewer["scans"] == 2
     assert 0 < fewer["points"] < data["points"] / 4
+
+
+def test_a_log_becomes_a_floor_plan(tmp_path, capsys):
+    log = carmen(tmp_path / "room.log")
+    plans = [tmp_path / f"plan{suffix}" for suffix in (".json", ".geojson", ".svg", ".yaml")]
+    command = ["linemap", str(log), "--out", str(tmp_path / "map.json"), "--plan"]
+    assert main([*command, *map(str, plans)]) == 0
+    captured = capsys.readouterr()
+    assert "floor plan    16.0 m2, 4 vertices, 0 holes; unknown: 0.0 m of the walls (0.0 %) in 0 places" in captured.out
+    assert "outline" in captured.err  # progress
+    for path in plans:
+        plan = load_plan(path)
+        off = np.abs(np.array(plan.bounds) - (-1.0, 0.0, 3.0, 4.0))
+        assert off.max() < (0.06 if path.suffix == ".yaml" else 0.01)
+    assert load_plan(plans[0]).meta["unknown"] == []
+    # What is told of, is told before the work.
+    for bad, message in (("plan.bmp", "the name must end in .json"), ("no/plan.json", "does not exist")):
+        assert main([*command, str(tmp_path / bad)]) == 2
+        captured = capsys.readouterr()
+        assert message in captured.err
+        assert "scan/s" not in captured.err
 
 
 def test_what_a_log_is_and_that_its_walls_do_not_fit_is_told(tmp_path, capsys):

@@ -34,11 +34,12 @@ ALLOWED = {
     "mapping": {"config", "robot_map"},
     "exploration": {"config", "scan"},
     "observation": {"config", "exploration", "mapping"},
+    "outline": {"config", "floorplan", "mapping"},
     "animation": {"optional", "snapshot"},
     "rendering": {"animation", "optional", "snapshot"},
     "env": {
-        "config", "exploration", "floorplan", "mapping", "observation", "rendering", "rewards", "scan", "sim",
-        "snapshot",
+        "config", "exploration", "floorplan", "mapping", "observation", "outline", "rendering", "rewards", "scan",
+        "sim", "snapshot",
     },
 }  # fmt: skip
 HEAVY = {
@@ -160,7 +161,7 @@ def test_folders_are_entered_by_their_public_names():
     for name, imported, where in project_imports():
         parts = imported.split(".")
         # Of evaluation and env, the cli and sim's few owners are used by module.
-        inner = len(parts) > 2 and parts[1] in ("mapping", "exploration", "floorplan")
+        inner = len(parts) > 2 and parts[1] in ("mapping", "exploration", "floorplan", "outline")
         if inner and part(name) != parts[1] and (part(name), imported) != ("env", "polyexplore_gym.exploration.shapes"):
             wrong.append(where)
     assert not wrong

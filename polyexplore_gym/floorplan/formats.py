@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -186,6 +187,20 @@ def save_plan(plan: FloorPlan, path: str | Path, *, resolution: float = 0.05) ->
         MissingDependencyError: a .dxf, and the extra `drawings` is not installed.
     """
     path = Path(path)
+    if path.suffix.lower() not in PLAN_SUFFIXES or path.suffix.lower() == ".yml":
+        known = ", ".join(suffix for suffix in PLAN_SUFFIXES if suffix != ".yml")
+        raise InvalidFloorPlanError(f"{path}: unknown suffix {path.suffix!r}; plans are written as {known}")
+    # Whole or not at all; of a ROS map the image before the yaml that names it.
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".plan-") as folder:
+        try:
+            _write(plan, Path(folder) / path.name, resolution)
+        except InvalidFloorPlanError as error:
+            raise InvalidFloorPlanError(f"{path}: {error}") from error
+        for part in sorted(Path(folder).iterdir()):
+            part.replace(path.with_name(part.name))
+
+
+def _write(plan: FloorPlan, path: Path, resolution: float) -> None:
     suffix = path.suffix.lower()
     if suffix in (".json", ".geojson"):
         content = to_mapping(plan) if suffix == ".json" else to_geojson(plan)
@@ -194,13 +209,10 @@ def save_plan(plan: FloorPlan, path: str | Path, *, resolution: float = 0.05) ->
         from polyexplore_gym.floorplan.rosmap import save_ros_map
 
         save_ros_map(plan, path, resolution)
-    elif suffix in (".dxf", ".svg"):
+    else:
         from polyexplore_gym.floorplan.drawing import save_drawing
 
         save_drawing(plan, path)
-    else:
-        known = ", ".join(suffix for suffix in PLAN_SUFFIXES if suffix != ".yml")
-        raise InvalidFloorPlanError(f"{path}: unknown suffix {path.suffix!r}; plans are written as {known}")
 
 
 def to_mapping(plan: FloorPlan) -> dict[str, Any]:

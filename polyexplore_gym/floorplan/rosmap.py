@@ -110,7 +110,7 @@ def save_ros_map(plan: FloorPlan, path: Path, resolution: float) -> None:
     try:
         height, width, corner = robot_map.raster(bounds[:2], bounds[2:], resolution)
     except ValueError as error:
-        raise InvalidFloorPlanError(f"{path}: {error}") from error
+        raise InvalidFloorPlanError(str(error)) from error
     image = _drawn(plan, np.array(corner), resolution, (height, width))
     robot_map.write(path, image, resolution, corner, plan.name)
 

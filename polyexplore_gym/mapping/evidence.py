@@ -9,12 +9,17 @@ that wall: a laser misses dark, bright and oblique surfaces from afar. A beam of
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from polyexplore_gym.mapping.extract import LEAST_RANGE
+from polyexplore_gym.mapping.line_map import LineMap
+
+RATIO = 3.0
+"""A wall goes where more than so many beams passed through for each that ended on it."""
 
 STEP = 0.05
 """Beams are counted on pieces of about this length, m."""
@@ -32,6 +37,53 @@ BINS = 64
 """So many steps; farther off, such a beam says nothing."""
 OBLIQUE = math.cos(math.radians(80.0))
 """A more oblique beam says nothing."""
+
+
+class Beams(NamedTuple):
+    """One scan."""
+
+    angles: np.ndarray
+    """(b,) in the laser's frame, rad, increasing"""
+    ranges: np.ndarray
+    """(b,) m; the maximum range or more is no return. NaN and less than 1e-6: nothing is known"""
+    pose: np.ndarray
+    """(3,) of the laser"""
+    covariance: np.ndarray
+    """(3, 3) of the pose"""
+
+
+def held_against(
+    line_map: LineMap, scans: Iterable[Beams], max_range: float, var_range: float, var_angle: float, ratio: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What is left of a map's walls and fragments when all beams have been held against them.
+
+    Args:
+        line_map: as it stands; it does not change.
+        scans: that it was made of.
+        max_range: of the laser, m.
+        var_range, var_angle: of the noise, m2, rad2.
+        ratio: a wall goes where more than so many beams passed through for each that ended there; 0 keeps all.
+
+    Returns:
+        Rows (R,) of the map that were looked at; what is left of them, parts (K, 4), and the index among these rows of
+        each (K,); and of each scan the share of its beams that passed through a wall, of those that met one (NaN: none
+        did).
+    """
+    rows = np.flatnonzero(line_map.alive)
+    # A row may have shrunk to a point, which is no obstacle of its own.
+    rows = rows[(line_map.segments[rows, :2] != line_map.segments[rows, 2:]).any(axis=1)]
+    whole, walls = line_map.segments[rows], line_map.line[rows] >= 0
+    begin = pieces_of(whole)
+    counts, misfits = Counts.zero(begin[-1]), []
+    for scan in scans:
+        noise = max_range, scan.pose, scan.covariance, var_range, var_angle
+        stopped, passed = count(whole, begin, walls, scan.angles, scan.ranges, *noise, counts)
+        misfits.append(passed / (stopped + passed) if stopped + passed else math.nan)
+    if ratio > 0:
+        parts, of = confirmed(whole, begin, counts.stopped, counts.through, ratio)
+    else:
+        parts, of = whole, np.arange(rows.size)
+    return rows, parts, of, np.array(misfits)
 
 
 def pieces_of(segments: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import shapely
 
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.errors import InvalidConfigError, InvalidLogError
-from polyexplore_gym.mapping.evidence import Counts, confirmed, count, pieces_of
+from polyexplore_gym.mapping.evidence import RATIO, Beams, held_against
 from polyexplore_gym.mapping.extract import LEAST_RANGE, check_scan, extract_lines
 from polyexplore_gym.mapping.line_map import LineMap
 from polyexplore_gym.mapping.logs import LaserLog, deskewed
@@ -22,9 +22,6 @@ MAX_RANGE = 30.0
 """Range from which on a beam has no return, if neither the log nor the user says, m."""
 TURN = 0.5
 """A turn by so much counts as much as the least travel between two scans, rad."""
-RATIO = 3.0
-"""A wall goes where more than so many beams passed through for each that ended on it."""
-
 MISFIT = 0.2
 """With a larger `LogMap.misfit` the poses are wrong: it is 0.01 and 0.06 in good logs (intel and csail), 0.17 and 0.23
 there with errors of 5 cm and 1 degree added to each pose, 0.7 with raw odometry."""
@@ -48,6 +45,8 @@ class LogMap:
     """(K,) standard deviation across each segment, m."""
     fragments: np.ndarray
     """(F, 4) end points, m."""
+    used: np.ndarray
+    """(scans used,) which scans of the log."""
     path: np.ndarray
     """(scans used, 3) x, y (m), heading (rad) of the laser."""
     points: np.ndarray
@@ -180,22 +179,14 @@ def map_log(
         points.append(_placed(angles[hit], ranges[hit], poses[k]))
         on_line.append(found.point_segment[hit] >= 0)
 
-    rows = np.flatnonzero(line_map.alive)
-    # A row may have shrunk to a point, which is no obstacle of its own.
-    rows = rows[(line_map.segments[rows, :2] != line_map.segments[rows, 2:]).any(axis=1)]
-    whole, line = line_map.segments[rows], line_map.line[rows]
-    parts, of = whole, np.arange(rows.size)
-    begin = pieces_of(whole)
-    walls, counts = line >= 0, Counts.zero(begin[-1])
+    def beams() -> Iterable[Beams]:
+        for k in track(used, "check"):
+            _, angles, ranges = check_scan(log.angles[k], log.ranges[k])
+            yield Beams(angles, ranges, poses[k], covariances[k])
+
     noise = max(sensor.sigma_range, config.range_floor) ** 2, sensor.sigma_angle**2
-    misfits = []
-    for k in track(used, "check"):
-        _, angles, ranges = check_scan(log.angles[k], log.ranges[k])
-        scan = angles, ranges, sensor.max_range, poses[k], covariances[k], *noise
-        stopped, passed = count(whole, begin, walls, *scan, counts)
-        misfits.append(passed / (stopped + passed) if stopped + passed else math.nan)
-    if ratio > 0:
-        parts, of = confirmed(whole, begin, counts.stopped, counts.through, ratio)
+    rows, parts, of, misfits = held_against(line_map, beams(), sensor.max_range, *noise, ratio)
+    whole, line = line_map.segments[rows], line_map.line[rows]
     intact = np.zeros(rows.size, bool)
     same = (parts == whole[of]).all(axis=1)
     intact[of[same]] = True
@@ -212,6 +203,7 @@ def map_log(
         segment_line=segment_line,
         segment_sigma=line_map.sigma[rows][of][wall],
         fragments=parts[~wall],
+        used=np.array(used),
         path=poses[used],
         points=np.concatenate(points),
         point_scan=np.repeat(np.arange(len(points)), [len(some) for some in points]),
@@ -220,7 +212,7 @@ def map_log(
         lines_of_scans=lines,
         contradicted=int((~intact & (line >= 0)).sum()),
         fragments_contradicted=int((~intact & (line < 0)).sum()),
-        misfits=np.array(misfits),
+        misfits=misfits,
     )
     if made.misfit > MISFIT:
         warnings.warn(_misfit_text(made.misfit, log), stacklevel=2)

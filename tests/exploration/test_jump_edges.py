@@ -390,7 +390,9 @@ def test_a_look_along_a_wall_shows_nothing_in_its_doorway():
         points, rays = sp.corner_points(angles, np.minimum(np.nan_to_num(ranges, nan=8.0), 8.0), math.pi, 8.0)
         box = sp.box_of(points, *apex)[None]
         blocks = sp.block_distances(points)[None]
-        look = sp.Scans(np.array([apex]), np.array([math.pi]), box, points[None], rays[None], blocks, angles, False, 8.0)
+        look = sp.Scans(
+            np.array([apex]), np.array([math.pi]), box, points[None], rays[None], blocks, angles, False, 8.0
+        )
         assert je.shown(edge, np.zeros(1), look, 0, jambs, tol).tolist() == [counts]
 
 

@@ -2,6 +2,7 @@
 
 import json
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,6 +38,24 @@ def test_round_trip(tmp_path, family, suffix):
     assert dict(again.meta) == dict(plan.meta)
     for ring, other in zip(plan.rings, again.rings, strict=True):
         np.testing.assert_array_equal(ring, other)
+
+
+@pytest.mark.parametrize("suffix", [".json", ".geojson", ".svg", ".yaml"])
+def test_a_plan_is_written_whole_or_not_at_all(tmp_path, monkeypatch, suffix):
+    plan, path = FloorPlan.create([[0, 0], [4, 0], [4, 3], [0, 3]]), tmp_path / f"a{suffix}"
+    save_plan(plan, path)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    written = Path.write_text
+
+    def torn(self, text, **options):
+        written(self, text[: len(text) // 2], **options)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", torn)
+    other = FloorPlan.create([[0, 0], [5, 0], [5, 3], [0, 3]])
+    with pytest.raises(OSError, match="No space left"):
+        save_plan(other, path)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 def test_saved_by_string_path_and_any_case(tmp_path):

@@ -13,7 +13,17 @@ from line_scenes import HALF, box, cast, distance, measure
 from polyexplore_gym.config import MappingConfig, SensorConfig
 from polyexplore_gym.errors import InvalidConfigError, InvalidLogError, MissingDependencyError, RenderingError
 from polyexplore_gym.floorplan import load_plan
-from polyexplore_gym.mapping import MAP_SUFFIXES, LaserLog, LineMap, map_log, read_log, save_map, sensor_of
+from polyexplore_gym.mapping import (
+    MAP_SUFFIXES,
+    LaserLog,
+    LineMap,
+    beams_of_log,
+    map_log,
+    read_log,
+    save_map,
+    sensor_of,
+    walls_of_log,
+)
 from polyexplore_gym.mapping.evidence import BIN, BINS, OBLIQUE, Counts, confirmed, count, pieces_of
 from polyexplore_gym.mapping.export import occupancy
 from polyexplore_gym.mapping.log_map import MISFIT
@@ -61,6 +71,24 @@ def test_a_room_is_mapped():
     for segment, i in zip(made.segments, made.segment_line, strict=True):
         offset = segment.reshape(2, 2) @ [math.cos(made.alpha[i]), math.sin(made.alpha[i])] - made.rho[i]
         assert np.abs(offset).max() < 0.005
+
+
+def test_the_walls_and_beams_of_a_log():
+    """Those of the map, and of the scans used; of beams without a return nothing is known."""
+    log = drive(DOOR[:3], circle(2.0, 2.0, 6) + circle(6.0, 2.0, 6), np.random.default_rng(1))
+    made = map_log(log, every=2)
+    walls, beams = walls_of_log(made), list(beams_of_log(log, made, 20.0))
+    np.testing.assert_array_equal(made.used, np.arange(0, 12, 2))
+    np.testing.assert_array_equal(walls.segments, made.segments)
+    normals = np.stack((np.cos(walls.alpha), np.sin(walls.alpha)), axis=1)[walls.line]
+    assert np.abs((walls.segments[:, :2] * normals).sum(axis=1) - walls.rho[walls.line]).max() < 0.01
+    assert len(beams) == 6
+    assert not all((log.ranges[k] < 20.0).all() for k in made.used)
+    for k, beam in zip(made.used, beams, strict=True):
+        np.testing.assert_array_equal(beam.pose, log.poses[k])
+        returned = log.ranges[k] < 20.0
+        np.testing.assert_array_equal(np.isfinite(beam.ranges), returned)
+        np.testing.assert_array_equal(beam.ranges[returned], log.ranges[k][returned])
 
 
 def test_it_is_the_line_map_of_the_scans_where_nothing_is_cut():
