@@ -1,0 +1,392 @@
+"""The robot's side of an exploration: scans and poses in, maps, nodes and the next way out. No simulator, no truth.
+
+The environment is built on it. On a robot it is used as it stands; `drive` is the robot's own and returns "arrived",
+"cut" (the leg's distance or turn is used up) or what stopped it:
+
+    explorer = Explorer({"preset": "turtlebot3", "exploration": {"scan_every": 0.5, "decide": "settled"}})
+    for heading in explorer.start_headings(pose[2]):
+        ...                                                  # turn there
+        explorer.insert(explorer.look(ranges, pose, covariance))
+    explorer.plan()
+    while not explorer.done:
+        leg = explorer.choose(policy.act(explorer.observation(), explorer.info(), rng))
+        while leg is not None:
+            ended = drive(leg)
+            if ended not in ("arrived", "cut"):
+                drive(explorer.stopped(ended, pose))         # turns to where it wanted to look
+            look = explorer.look(ranges, pose, covariance)
+            leg = explorer.passing(look) if ended == "cut" else explorer.arrived(look)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.disc import contact_along
+from polyexplore_gym.errors import InvalidActionError, InvalidScanError
+from polyexplore_gym.exploration import ExplorationMap, Remains
+from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
+from polyexplore_gym.observation import Observed, observe
+from polyexplore_gym.scan import Scan, beam_angles, filled
+
+_SCAN_TURN = 0.5 * math.pi
+"""Scans on the way are also taken after so much turning (rad) or half the field of view, if that is less."""
+_CREEP, _HALT = 0.4, 0.1
+"""A robot that decides on the way looks again before its disc enters what no scan has shown, and in there after so many
+radii at a time; it can halt so many radii behind that place. Tuned: few bumps for little time."""
+_LEAST_RANGE = 1e-6
+"""Smaller readings (m) say nothing, as in `extract_lines`."""
+
+
+class Leg(NamedTuple):
+    """What to drive until the next scan."""
+
+    path: np.ndarray
+    """(k, 2) the way, from where the robot is, m; to be at rest at its end. One point: turn on the spot."""
+    heading: float | None
+    """Where to turn to at its end, rad; None: there is no need to, the route goes on."""
+    distance: float
+    """Scan after so much way, m, without stopping: the leg is cut there. inf: at its end."""
+    turn: float
+    """Scan after so much turning, too, rad."""
+    route: np.ndarray
+    """(m, 2) the whole way to the node; `path` is its beginning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One scan, what lines it shows and what they say of the pose."""
+
+    scan: Scan
+    """Readings at the corrected pose; what is unknown claims nothing (`scan.filled`)."""
+    lines: ScanLines
+    """In the robot's frame."""
+    smoothed: np.ndarray
+    """(n,) ranges, m, on a line where the nominal beam meets it."""
+    correction: Correction
+    """The pose as the walls correct it, if `pose.mode` is "slam", else as it was given."""
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(3,) corrected x, y (m) and heading (rad)."""
+        return self.correction.pose
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(3, 3) covariance of the corrected pose, m2, m rad, rad2."""
+        return self.correction.covariance
+
+
+class Explorer:
+    """Owner of what a robot knows while it explores: the line map, the exploration map, and what it is about to do.
+
+    It is told of scans (`look`, then `insert`, `passing` or `arrived`) and of what stopped a drive (`stopped`), and
+    says where to drive (`choose`, `passing`). Poses are those of the laser, which is taken for the middle of the body.
+    """
+
+    def __init__(self, config: EnvConfig | Mapping[str, Any] | None = None) -> None:
+        """Begin an exploration in which nothing is known.
+
+        Args:
+            config: as the environment's; of use are `sensor`, `robot`, `mapping`, `exploration`, `observation`, and
+                `pose.mode`: "exact" or "gaussian" if a localiser gives poses with independent errors, "odometry" if
+                they drift, "slam" if they drift and are to be corrected by the walls.
+
+        Raises:
+            InvalidConfigError: a field is unknown or out of range.
+        """
+        c = config if isinstance(config, EnvConfig) else from_mapping(EnvConfig, {} if config is None else config)
+        self.config = c
+        self.angles = beam_angles(c.sensor)
+        """(n,) the beams that `look` expects, rad in the robot's frame."""
+        self._mapping = c.mapping.resolved(c.robot.radius)
+        self.line_map = LineMap(self._mapping, c.sensor)
+        self.exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
+        self.localizer = Localizer() if c.pose.mode == "slam" else None
+        self.scans = 0
+        """Scans taken into the maps."""
+        self.plans = 0
+        """How often paths were planned."""
+        self.ended = "start"
+        """Why the last drive ended: "arrived", "settled", "interval", "blocked", or what `stopped` was told."""
+        self.route = np.zeros((1, 2))
+        """(m, 2) the way to the node chosen last, as it was planned last, m."""
+        self._target, self._chosen_heading, self._heading = -1, 0.0, 0.0
+        self._driven, self._came = 0.0, [np.zeros((1, 2))]
+        self._stopped = False
+        self._look: Look | None = None
+        self._observed: Observed | None = None
+
+    # Scans ------------------------------------------------------------------------------------
+
+    def look(self, ranges: np.ndarray, pose: np.ndarray, covariance: np.ndarray | None = None) -> Look:
+        """Find the lines of a scan, and correct the pose by them in the mode "slam". Goes into no map yet.
+
+        Args:
+            ranges: (n,) m, of the beams `angles`; inf, or the maximum range and more: nothing met; NaN, zero and
+                negative: unknown. (`polyexplore_gym.scan.on_beams` takes over readings of other beams.)
+            pose: (3,) x, y (m) and heading (rad) of the scan in the map frame.
+            covariance: (3, 3) of the pose, m2, m rad, rad2; None: exact.
+
+        Raises:
+            InvalidScanError: an array has another shape, or the pose or its covariance is not finite.
+        """
+        ranges, pose = np.asarray(ranges), np.array(pose, np.float64)
+        covariance = np.zeros((3, 3)) if covariance is None else np.array(covariance, np.float64)
+        sensor = self.config.sensor
+        if ranges.shape != (sensor.beams,) or ranges.dtype.kind not in "fiu":
+            raise InvalidScanError(f"ranges of shape {ranges.shape}: expected {sensor.beams} numbers (sensor.beams)")
+        for name, array, shape in (("pose", pose, (3,)), ("covariance", covariance, (3, 3))):
+            if array.shape != shape or not np.isfinite(array).all():
+                raise InvalidScanError(f"{name} {array.tolist()}: expected finite numbers of shape {shape}")
+        found = extract_lines(self.angles, ranges, sensor, self._mapping)
+        if self.localizer is None:
+            fix = Correction.none(pose, covariance)
+        else:
+            fix = self.localizer.correct(found, self.line_map, pose, covariance)
+        readings = np.where(ranges >= sensor.max_range, math.inf, np.where(ranges >= _LEAST_RANGE, ranges, math.nan))
+        limits = sensor, self.exploration.tol.gap, self.config.robot.radius
+        scan = Scan(self.angles, filled(readings, *limits), fix.pose, fix.covariance, sensor.full_circle)
+        return Look(scan, found, filled(found.smoothed, *limits), fix)
+
+    def insert(self, look: Look, target: int | None = None, *, arrived: bool = True) -> None:
+        """Take a scan into both maps; `target`: id of the jump edge that the robot set out to measure by it."""
+        drifting = self.config.pose.mode == "odometry"
+        lines, fix = self.line_map, look.correction
+        touched = lines.insert(look.lines, fix.pose, fix.relative, drifting=drifting)
+        if self.localizer is not None:
+            self.localizer.learn(lines)
+        self.exploration.insert(
+            look.scan,
+            lines.segments,
+            lines.alive,
+            touched,
+            point_segment=look.lines.point_segment,
+            ranges=look.smoothed,
+            target=target,
+            arrived=arrived,
+        )
+        self._look, self._observed = look, None
+        self.scans += 1
+
+    def start_headings(self, heading: float, all_round: bool | None = None) -> list[float]:
+        """Headings (rad) to scan in before the first choice: all round, or `heading` alone.
+
+        Args:
+            heading: of the robot, rad.
+            all_round: None: as `exploration.look_around` says. (Where one scan shows no way, look all round.)
+        """
+        turns = 1
+        if self.config.exploration.look_around if all_round is None else all_round:
+            turns = math.ceil(2.0 * math.pi / self.config.sensor.field_of_view - 1e-9)
+        return [heading + i * 2.0 * math.pi / turns for i in range(turns)]
+
+    def plan(self, came: np.ndarray | None = None, halt: np.ndarray | None = None) -> None:
+        """Bring nodes and paths up to date for a robot where the last scan was made.
+
+        Args:
+            came: (k, 2) the way driven since paths were planned last, m: the way back out of a tight place.
+            halt: (2,) where the robot can come to rest at the earliest, m, if it moves: paths lead there first.
+        """
+        pose, lines = self._last.pose, self.line_map
+        self.exploration.plan(pose, lines.segments, lines.alive, came, halt, lines.lone)
+        self.plans += 1
+        if self._target < 0:
+            self.route = pose[None, :2]
+        self._came = [pose[None, :2]]
+        self._observed = None
+
+    # Decisions --------------------------------------------------------------------------------
+
+    @property
+    def done(self) -> bool:
+        """Whether no node can be reached: the exploration is over."""
+        return not self.exploration.reachable.any()
+
+    @property
+    def observed(self) -> Observed:
+        """The observation as it stands, with what it left out; not to be changed."""
+        if self._observed is None:
+            c, look = self.config, self._last
+            self._observed = observe(
+                self.exploration, self.line_map, look.pose, look.covariance, c.sensor.max_range, c.observation,
+                self._target,
+            )  # fmt: skip
+        return self._observed
+
+    def observation(self) -> dict[str, np.ndarray]:
+        """What a policy gets, as from the environment; the caller's own to change."""
+        return {key: value.copy() for key, value in self.observed.arrays.items()}
+
+    def action_masks(self) -> np.ndarray:
+        """(max_nodes,) bool: which nodes can be chosen."""
+        return self.observed.arrays["action_mask"].astype(bool)
+
+    def outcome(self, budget: bool = False) -> dict[str, Any]:
+        """How the exploration stands, and which jump edges (number and metres) it leaves; `budget`: it is used up."""
+        if not budget and self.observed.arrays["action_mask"].any():
+            return {"status": "running", **Remains(0, 0.0, 0, 0.0)._asdict()}
+        left = self.exploration.remains()
+        status = "budget" if budget else "unreached" if left.unreached or left.given_up else "complete"
+        return {"status": status, **left._asdict()}
+
+    def info(self, budget: bool = False) -> dict[str, Any]:
+        """What a policy gets beside the observation: of the environment's `info` what a robot knows itself."""
+        return {
+            "action_mask": self.observed.arrays["action_mask"].copy(),
+            "measurements": self.scans,
+            "path": tuple(map(tuple, self.route.tolist())),
+            "ended": self.ended,
+            "outcome": self.outcome(budget),
+            "cut": {"nodes": self.observed.cut_nodes, "lines": self.observed.cut_lines},
+        }
+
+    @property
+    def max_speed(self) -> float:
+        """Drive no faster, m/s: one that decides on the way can then halt within the way between two scans."""
+        robot, exploration = self.config.robot, self.config.exploration
+        if exploration.decide == "arrival":
+            return robot.max_speed
+        return min(robot.max_speed, math.sqrt(2.0 * robot.max_acceleration * exploration.scan_every))
+
+    def choose(self, action: int) -> Leg:
+        """Set out for a node: what to drive first.
+
+        Raises:
+            InvalidActionError: no such node, or it cannot be reached.
+        """
+        mask = self.observed.arrays["action_mask"]
+        if not 0 <= action < len(mask) or not mask[action]:
+            valid = np.flatnonzero(mask).tolist()
+            raise InvalidActionError(f"action {action}: no node that can be reached; those are {valid}")
+        row, chains = int(self.observed.rows[action]), self.exploration.chains
+        self._target = int(chains.id[row])
+        self._heading = self._chosen_heading = float(chains.node[row, 2])
+        self.route = self.exploration.path_to(row)
+        self._driven, self._stopped = 0.0, False
+        return self._leg(self.route)
+
+    def passing(
+        self,
+        look: Look,
+        *,
+        rest: np.ndarray | None = None,
+        driven: float | None = None,
+        came: np.ndarray | None = None,
+        halt: np.ndarray | None = None,
+    ) -> Leg | None:
+        """Take in a scan on the way: what to drive next, or None if it is time to choose again.
+
+        Args:
+            look: the scan.
+            rest: (k, 2) what is left of the leg's route, from where the robot is, m. None: from the place of the scan
+                on along the nearest part of the route.
+            driven: way since the choice, m. None: along the route.
+            came: (k, 2) the way since paths were planned last (`plans` counts that), m. None: along the route.
+            halt: see `plan`.
+        """
+        exploration, lines, c = self.exploration, self.line_map, self.config.exploration
+        here, route = look.pose[None, :2], self._way
+        rest = _rest(route, here) if rest is None else rest
+        passed = np.concatenate((route[:1], route[1 : len(route) - len(rest) + 1], here))
+        self._driven = self._driven + _length(passed) if driven is None else driven
+        self._came.append(passed[1:])
+        self.insert(look)
+        if c.decide == "arrival":
+            return self._leg(rest)
+        if self._target not in exploration.chains.id:
+            return self._decide("settled", came, halt)
+        if c.decide == "interval" and self._driven >= c.decide_every - 1e-9:
+            return self._decide("interval", came, halt)
+        if not exploration.blocked(rest, lines.segments, lines.alive, lines.lone):
+            return self._leg(rest)
+        self.plan(np.concatenate(self._came) if came is None else came, halt)
+        row = np.flatnonzero(exploration.chains.id == self._target)
+        if not len(row) or not exploration.reachable[row[0]]:
+            exploration.attempted(self._target)
+            return self._decide("blocked", here, halt)
+        self.route, self._heading = exploration.path_to(int(row[0])), float(exploration.chains.node[row[0], 2])
+        return self._leg(self.route)
+
+    def stopped(self, why: str, pose: np.ndarray, bearing: float | None = None) -> Leg:
+        """Something ended the drive before its time: how to turn, from where the robot is, to look all the same.
+
+        The scan after it goes to `arrived`.
+
+        Args:
+            why: such as "bump", for `ended`.
+            pose: (3,) where the robot is, m and rad.
+            bearing: where on its rim it felt an obstacle, rad in its frame; paths will lead around that.
+        """
+        pose = np.asarray(pose, np.float64)
+        if bearing is not None:
+            self.exploration.bump(pose, bearing + pose[2])
+        self.ended, self._stopped = why, True
+        here = pose[None, :2]
+        return Leg(here, self._chosen_heading, math.inf, math.inf, here)
+
+    def arrived(self, look: Look, *, came: np.ndarray | None = None, halt: np.ndarray | None = None) -> Leg | None:
+        """Take in the scan at the end of a drive; None: it is time to choose again. `came`, `halt`: see `passing`."""
+        self.insert(look, self._target, arrived=not self._stopped)
+        self._came += [self._way[1:], look.pose[None, :2]] if not self._stopped else [look.pose[None, :2]]
+        return self._decide(self.ended if self._stopped else "arrived", came, halt)
+
+    def _decide(self, ended: str, came: np.ndarray | None, halt: np.ndarray | None) -> Leg | None:
+        """End a drive: plan for the next choice. There is no next leg."""
+        self.ended = ended
+        self.plan(np.concatenate(self._came) if came is None else came, halt)
+        return None
+
+    def _leg(self, route: np.ndarray) -> Leg:
+        """What to drive of a route (k, 2) until it is time for a scan on the way."""
+        c, radius, sensor = self.config.exploration, self.config.robot.radius, self.config.sensor
+        self._way = route
+        distance = turn = math.inf
+        if c.scan_every > 0.0:
+            if not sensor.full_circle:
+                turn = min(_SCAN_TURN, 0.5 * sensor.field_of_view)
+            if _length(route) > 1.5 * c.scan_every:  # else the scan at the end will do
+                distance = c.scan_every
+        if c.decide == "arrival":
+            return Leg(route, self._heading, distance, turn, route)
+        seen = max(contact_along(self.exploration.pieces.segments, route, radius), _CREEP * radius)
+        path, whole = _cut_off(route, seen + _HALT * radius)
+        return Leg(path, self._heading if whole else None, min(distance, seen), turn, route)
+
+    @property
+    def _last(self) -> Look:
+        if self._look is None:
+            raise InvalidScanError("no scan so far: look() and insert() come first")
+        return self._look
+
+
+def _length(path: np.ndarray) -> float:
+    """Of a path (k, 2), m."""
+    return float(np.hypot(*np.diff(path, axis=0).T).sum())
+
+
+def _rest(route: np.ndarray, here: np.ndarray) -> np.ndarray:
+    """What is left of a route (k, 2) for a robot near it: its place (1, 2), and the vertices that it has not passed."""
+    legs = np.diff(route, axis=0)
+    if not len(legs):
+        return here
+    square = np.maximum((legs**2).sum(axis=1), 1e-300)
+    along = np.clip(((here - route[:-1]) * legs).sum(axis=1) / square, 0.0, 1.0)
+    off = np.hypot(*(route[:-1] + along[:, None] * legs - here).T)
+    return np.concatenate((here, route[int(off.argmin()) + 1 :]))
+
+
+def _cut_off(path: np.ndarray, way: float) -> tuple[np.ndarray, bool]:
+    """The first so many metres of a path (k, 2), and whether that is all of it."""
+    run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
+    if way >= run[-1]:
+        return path, True
+    k = int(np.searchsorted(run, way))
+    share = (way - run[k - 1]) / (run[k] - run[k - 1])
+    return np.concatenate((path[:k], path[k - 1 : k] + share * (path[k] - path[k - 1]))), False
