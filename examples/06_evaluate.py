@@ -3,11 +3,15 @@
 python examples/06_evaluate.py
 """
 
+from pathlib import Path
+
 import numpy as np
 
 from polyexplore_gym.config import EnvConfig, from_mapping
 from polyexplore_gym.evaluation import Study, evaluate, name_policies, summarize, summary_text, write_tables
 from polyexplore_gym.floorplan import suite
+
+OUT = Path("results/example")
 
 if __name__ == "__main__":
     study = Study(
@@ -17,9 +21,9 @@ if __name__ == "__main__":
         sensing=("stops", "moving"),
         config=from_mapping(EnvConfig, {"drive": {"mode": "kinematic"}}),
     )
-    records = evaluate(study, out="results/example", workers=1)  # again: only what is missing is played
+    records = evaluate(study, out=OUT, workers=1)  # again: only what is missing is played
     summary = summarize(records, np.random.default_rng(0), reference="nearest")
     print(summary_text(summary))
-    print("written:", ", ".join(path.name for path in write_tables(summary, "results/example")))
+    print("written:", ", ".join(path.name for path in write_tables(summary, OUT)))
     longest = max(records, key=lambda record: record.distance)
     print(f"longest: {longest.plan}, {longest.policy}, {longest.distance:.1f} m, drives ended {dict(longest.ends)}")

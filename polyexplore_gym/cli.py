@@ -216,6 +216,41 @@ class Eval:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """Record episodes of a policy as a Minari data set, for offline learning."""
+
+    suite: tuple[str, ...] = ("home-train",)
+    """Suites of generated plans."""
+    plans: tuple[Path, ...] = ()
+    """Plan files, or folders of them, instead of suites."""
+    first: int | None = None
+    """Only the first so many plans, of each suite."""
+    policy: str = "nearest"
+    """Name of a baseline, or module:attribute for an own policy."""
+    seeds: int = 1
+    """Starts (and streams of noise) on each plan."""
+    observation: Literal["dict", "scaled", "flat", "graph", "grid"] = "dict"
+    """What is kept of what was seen: the environment's own arrays, or those of a wrapper."""
+    name: str = "polyexplore/nearest-v0"
+    """Name of the data set."""
+    out: Path = Path("results/datasets")
+    """Folder of data sets, which Minari finds by the variable MINARI_DATASETS_PATH."""
+    workers: int = 0
+    """Processes; 0: one a core."""
+    placement: Placement | None = None
+    """Where nodes are placed, instead of what the configuration says."""
+    sensing: Sensing | None = None
+    """When the robot measures and decides (see bench), instead of what the configuration says."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Linemap:
     """Make the line map of a laser log; prints a summary and writes the map.
 
@@ -487,6 +522,43 @@ def linemap(options: Linemap) -> int:
     return 0
 
 
+def record(options: Record) -> int:
+    """Record a data set."""
+    from tqdm import tqdm
+
+    from polyexplore_gym.evaluation.recording import Recording
+    from polyexplore_gym.evaluation.recording import record as write
+    from polyexplore_gym.optional import require
+
+    minari = require("minari", "datasets")
+    if options.seeds < 1:
+        raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
+    config = _config(options.config, options.preset, options.drive, options.placement, options.sensing)
+    if options.observation != "dict":
+        config = replace(config, observation=replace(config.observation, relative=True))
+    suites = () if options.plans else options.suite
+    recording = Recording(
+        policy=options.policy,
+        plans=list(_bench_plans(replace(options, suite=suites), config)),
+        seeds=range(options.seeds),
+        config=config,
+        observation=options.observation,
+    )
+    place = write(
+        recording,
+        options.out,
+        options.name,
+        workers=options.workers or os.cpu_count() or 1,
+        track=lambda episodes, total: tqdm(episodes, total=total, unit="episode", dynamic_ncols=True),
+    )
+    made = minari.MinariDataset(place)
+    size = sum(path.stat().st_size for path in place.iterdir()) / 1e6
+    print(
+        f"{options.name}: {made.total_episodes} episodes, {made.total_steps} decisions, {size:.1f} MB\nwritten: {place}"
+    )
+    return 0
+
+
 _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (Bench, bench),
     "run": (Run, run),
@@ -495,6 +567,7 @@ _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "report": (Report, report),
     "plan": (Plan, plan),
     "linemap": (Linemap, linemap),
+    "record": (Record, record),
 }
 
 
@@ -566,7 +639,7 @@ def _suite(name: str) -> Any:
         raise InvalidConfigError(str(error)) from error
 
 
-def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
+def _bench_plans(options: Bench | Record, config: EnvConfig) -> Iterator[FloorPlan]:
     """The plans to run on. A bad file is named and left out; raises when no plan is left."""
     if options.suite and options.plans:
         raise InvalidConfigError("give either --suite or --plans")

@@ -20,6 +20,7 @@ The environment is built on it. On a robot it is used as it stands; `drive` is t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from polyexplore_gym.config import EnvConfig, from_mapping
+from polyexplore_gym.config import EnvConfig, ObservationConfig, from_mapping
 from polyexplore_gym.disc import contact_along
 from polyexplore_gym.errors import InvalidActionError, InvalidScanError
 from polyexplore_gym.exploration import ExplorationMap, Remains
@@ -213,16 +214,22 @@ class Explorer:
     def observed(self) -> Observed:
         """The observation as it stands, with what it left out; not to be changed."""
         if self._observed is None:
-            c, look = self.config, self._last
-            self._observed = observe(
-                self.exploration, self.line_map, look.pose, look.covariance, c.sensor.max_range, c.observation,
-                self._target,
-            )  # fmt: skip
+            self._observed = self._observe(self.config.observation)
         return self._observed
 
-    def observation(self) -> dict[str, np.ndarray]:
-        """What a policy gets, as from the environment; the caller's own to change."""
-        return {key: value.copy() for key, value in self.observed.arrays.items()}
+    def _observe(self, config: ObservationConfig) -> Observed:
+        look, reach = self._last, self.config.sensor.max_range
+        return observe(self.exploration, self.line_map, look.pose, look.covariance, reach, config, self._target)
+
+    def observation(self, relative: bool | None = None) -> dict[str, np.ndarray]:
+        """What a policy gets, as from the environment; the caller's own to change.
+
+        `relative`: seen from the robot or in the map frame; None: as `observation.relative` says.
+        """
+        config = self.config.observation
+        if relative is None or relative == config.relative:
+            return {key: value.copy() for key, value in self.observed.arrays.items()}
+        return self._observe(dataclasses.replace(config, relative=relative)).arrays
 
     def action_masks(self) -> np.ndarray:
         """(max_nodes,) bool: which nodes can be chosen."""

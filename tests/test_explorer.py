@@ -168,6 +168,20 @@ def test_a_robot_that_tells_little_sees_all(pose):
     assert seen.buffer(0.1).intersection(floor).area > 0.97 * floor.area
 
 
+def test_either_frame_can_be_asked_for():
+    views = {}
+    for relative in (False, True):
+        env = PolyExploreEnv(generate("home", 6), config={"observation": {"relative": relative}})
+        seen, info = env.reset(seed=1)
+        seen, *_ = env.step(int(info["action_mask"].argmax()))
+        views[relative] = env.explorer.observation(not relative)
+        assert all(np.array_equal(seen[key], value) for key, value in env.explorer.observation().items())
+        assert all(np.array_equal(seen[key], value) for key, value in env.explorer.observation(relative).items())
+        if relative:
+            assert all(np.array_equal(seen[key], value) for key, value in views[False].items())
+    assert not np.array_equal(views[True]["node_position"], views[False]["node_position"])
+
+
 def test_what_is_left_of_a_route():
     route = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 3.0], [5.0, 3.0]])
     for along, left in (((0.0, 0.0), 3), ((1.2, 0.1), 3), ((2.1, 0.5), 2), ((2.2, 3.1), 1), ((5.0, 3.0), 1)):

@@ -55,6 +55,8 @@ HEAVY = {
     "PIL",
     "ray",
     "jinja2",
+    "minari",
+    "h5py",
     "ezdxf",
 }
 SCRIPTED = (
