@@ -39,7 +39,8 @@ class ExploreNode(Node):
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
         at = self.tf.lookup_transform("map", scan.header.frame_id, scan.header.stamp).transform
         pose = np.array([at.translation.x, at.translation.y, 2.0 * math.atan2(at.rotation.z, at.rotation.w)])
-        look = self.explorer.look(on_beams(angles, scan.ranges, self.explorer.config.sensor), pose, COVARIANCE)
+        readings = np.where(np.array(scan.ranges) < scan.range_min, math.nan, scan.ranges)  # too near: unknown
+        look = self.explorer.look(on_beams(angles, readings, self.explorer.config.sensor), pose, COVARIANCE)
         if self.leg is None:
             self.explorer.insert(look)
             self.explorer.plan()

@@ -39,8 +39,8 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=200)
     plans = [suite("home-train").plan(i) for i in range(parser.parse_args().episodes)]
     config = from_mapping(EnvConfig, CONFIG)
-    teacher = Recording(policy="tour", plans=plans, config=config, observation="flat")
-    data = minari.MinariDataset(record(teacher, "datasets", "polyexplore/tour-v0"))
+    teacher = Recording(policy="modified_sum", plans=plans, config=config, observation="flat")
+    data = minari.MinariDataset(record(teacher, "datasets", "polyexplore/modified-sum-v0"))
 
     seen = torch.tensor(np.concatenate([e.observations[:-1] for e in data])).reshape(-1, 32, len(FEATURES))
     chosen = torch.tensor(np.concatenate([e.actions for e in data]))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -213,6 +214,36 @@ class Eval:
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
     """Draw the plots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Play:
+    """Explore a plan yourself, in a window that shows what the robot knows, against a policy from the same start.
+
+    A click on a node chooses it, and so does its number and enter. The result is kept as a policy's is.
+    """
+
+    plan: tyro.conf.Positional[str]
+    """A plan file, or a plan of a suite: home-test/3."""
+    player: str = "person"
+    """Your name: the results are kept under it."""
+    against: str = "nearest"
+    """Name of a baseline, or module:attribute for an own policy."""
+    seed: int = 0
+    """Seed of the start and the noise."""
+    placement: Placement = "in_front"
+    """Where nodes are placed."""
+    sensing: Sensing = "moving"
+    """When the robot measures and decides (see bench)."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    out: Path = Path("results/play")
+    """Folder of the games: each gets a folder of its own, by plan, seed and player."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -522,6 +553,35 @@ def linemap(options: Linemap) -> int:
     return 0
 
 
+def play(options: Play) -> int:
+    """Let a person explore a plan."""
+    from polyexplore_gym.evaluation.play import Board, Person
+    from polyexplore_gym.evaluation.play import play as game
+
+    if options.seed < 0:
+        raise InvalidConfigError(f"--seed {options.seed}: must not be negative")
+    if not options.player or options.player == options.against:
+        raise InvalidConfigError(f"--player {options.player!r}: must be a name of your own")
+    config = _config(options.config, options.preset, options.drive, options.placement, options.sensing)
+    plan = _plan(options.plan, config.robot.radius, None, options.reading)
+    plan.check_connected(config.robot.radius)
+    boards: list[Board] = []
+
+    def ask(scene: Snapshot) -> int:
+        boards[:] = boards or [Board()]  # no window for a game that was played already
+        return boards[0].ask(scene)
+
+    person = Person(ask, options.player)
+    folder = options.out / re.sub(r"[^\w.-]+", "-", f"{plan.name}-{options.seed}-{options.player}")
+    own, other = game(plan, config, folder, person, seed=options.seed, reference=options.against)
+    if not person.asked:
+        print(f"played before: {folder}; give another --player or --out to play again")
+    print(_run_text(own, plan), _run_text(other, plan), sep="\n")
+    if own.ended and other.ended and other.distance > 0.0:
+        print(f"{own.policy} / {other.policy}: {own.distance / other.distance:.2f} of the distance; kept in {folder}")
+    return 0 if own.status != "failed" else 1
+
+
 def record(options: Record) -> int:
     """Record a data set."""
     from tqdm import tqdm
@@ -568,6 +628,7 @@ _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "plan": (Plan, plan),
     "linemap": (Linemap, linemap),
     "record": (Record, record),
+    "play": (Play, play),
 }
 
 
