@@ -28,17 +28,22 @@ COVARIANCE = np.diag([0.02, 0.02, math.radians(0.5)]) ** 2
 class ExploreNode(Node):
     def __init__(self):
         super().__init__("explore")
-        self.explorer, self.policy, self.rng = Explorer(CONFIG), make_policy("nearest"), np.random.default_rng(0)
+        self.explorer, self.policy, self.rng = None, make_policy("nearest"), np.random.default_rng(0)
         self.tf = Buffer()
         self.listener = TransformListener(self.tf, self)
         self.controller = ActionClient(self, FollowPath, "follow_path")
         self.leg, self.goals, self.ended, self.pose, self.driven = None, 0, None, None, 0.0
         self.create_subscription(LaserScan, "scan", self.on_scan, 10)
 
+    def where(self, frame, other, stamp):
+        at = self.tf.lookup_transform(frame, other, stamp).transform
+        return np.array([at.translation.x, at.translation.y, 2.0 * math.atan2(at.rotation.z, at.rotation.w)])
+
     def on_scan(self, scan):
         angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
-        at = self.tf.lookup_transform("map", scan.header.frame_id, scan.header.stamp).transform
-        pose = np.array([at.translation.x, at.translation.y, 2.0 * math.atan2(at.rotation.z, at.rotation.w)])
+        if self.explorer is None:
+            self.explorer = Explorer(CONFIG, mount=self.where("base_link", scan.header.frame_id, scan.header.stamp))
+        pose = self.where("map", "base_link", scan.header.stamp)
         readings = np.where(np.array(scan.ranges) < scan.range_min, math.nan, scan.ranges)  # too near: unknown
         look = self.explorer.look(on_beams(angles, readings, self.explorer.config.sensor), pose, COVARIANCE)
         if self.leg is None:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -30,19 +30,17 @@ import numpy as np
 
 from polyexplore_gym.config import EnvConfig, ObservationConfig, from_mapping
 from polyexplore_gym.disc import contact_along
-from polyexplore_gym.errors import InvalidActionError, InvalidScanError
+from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidScanError
 from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.observation import Observed, observe
-from polyexplore_gym.scan import Scan, beam_angles, filled
+from polyexplore_gym.scan import Scan, beam_angles, carried, filled, readings
 
 _SCAN_TURN = 0.5 * math.pi
 """Scans on the way are also taken after so much turning (rad) or half the field of view, if that is less."""
 _CREEP, _HALT = 0.4, 0.1
 """A robot that decides on the way looks again before its disc enters what no scan has shown, and in there after so many
 radii at a time; it can halt so many radii behind that place. Tuned: few bumps for little time."""
-_LEAST_RANGE = 1e-6
-"""Smaller readings (m) say nothing, as in `extract_lines`."""
 
 
 class Leg(NamedTuple):
@@ -65,47 +63,47 @@ class Look:
     """One scan, what lines it shows and what they say of the pose."""
 
     scan: Scan
-    """Readings at the corrected pose; what is unknown claims nothing (`scan.filled`)."""
+    """Readings at the laser's corrected pose; what is unknown claims nothing (`scan.filled`)."""
     lines: ScanLines
-    """In the robot's frame."""
+    """In the laser's frame."""
     smoothed: np.ndarray
     """(n,) ranges, m, on a line where the nominal beam meets it."""
     correction: Correction
-    """The pose as the walls correct it, if `pose.mode` is "slam", else as it was given."""
-
-    @property
-    def pose(self) -> np.ndarray:
-        """(3,) corrected x, y (m) and heading (rad)."""
-        return self.correction.pose
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """(3, 3) covariance of the corrected pose, m2, m rad, rad2."""
-        return self.correction.covariance
+    """The laser's pose as the walls correct it, if `pose.mode` is "slam", else as it was given."""
+    pose: np.ndarray
+    """(3,) the robot's corrected x, y (m) and heading (rad)."""
+    covariance: np.ndarray
+    """(3, 3) its covariance, m2, m rad, rad2."""
 
 
 class Explorer:
     """Owner of what a robot knows while it explores: the line map, the exploration map, and what it is about to do.
 
     It is told of scans (`look`, then `insert`, `passing` or `arrived`) and of what stopped a drive (`stopped`), and
-    says where to drive (`choose`, `passing`). Poses are those of the laser, which is taken for the middle of the body.
+    says where to drive (`choose`, `passing`). Poses are those of the middle of the body.
     """
 
-    def __init__(self, config: EnvConfig | Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, config: EnvConfig | Mapping[str, Any] | None = None, mount: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
         """Begin an exploration in which nothing is known.
 
         Args:
             config: as the environment's; of use are `sensor`, `robot`, `mapping`, `exploration`, `observation`, and
                 `pose.mode`: "exact" or "gaussian" if a localiser gives poses with independent errors, "odometry" if
                 they drift, "slam" if they drift and are to be corrected by the walls.
+            mount: x, y (m) and heading (rad) of the laser in the robot's frame.
 
         Raises:
-            InvalidConfigError: a field is unknown or out of range.
+            InvalidConfigError: a field is unknown or out of range, or the mount is no pose.
         """
         c = config if isinstance(config, EnvConfig) else from_mapping(EnvConfig, {} if config is None else config)
         self.config = c
+        self.mount = np.array(mount, np.float64)
+        if self.mount.shape != (3,) or not np.isfinite(self.mount).all():
+            raise InvalidConfigError(f"mount = {mount!r}: must be x, y (m) and heading (rad) of the laser")
         self.angles = beam_angles(c.sensor)
-        """(n,) the beams that `look` expects, rad in the robot's frame."""
+        """(n,) the beams that `look` expects, rad in the laser's frame."""
         self._mapping = c.mapping.resolved(c.robot.radius)
         self.line_map = LineMap(self._mapping, c.sensor)
         self.exploration = ExplorationMap(c.exploration, c.sensor, c.robot.radius)
@@ -132,7 +130,7 @@ class Explorer:
         Args:
             ranges: (n,) m, of the beams `angles`; inf, or the maximum range and more: nothing met; NaN, zero and
                 negative: unknown. (`polyexplore_gym.scan.on_beams` takes over readings of other beams.)
-            pose: (3,) x, y (m) and heading (rad) of the scan in the map frame.
+            pose: (3,) x, y (m) and heading (rad) of the robot in the map frame when it was taken.
             covariance: (3, 3) of the pose, m2, m rad, rad2; None: exact.
 
         Raises:
@@ -147,14 +145,17 @@ class Explorer:
             if array.shape != shape or not np.isfinite(array).all():
                 raise InvalidScanError(f"{name} {array.tolist()}: expected finite numbers of shape {shape}")
         found = extract_lines(self.angles, ranges, sensor, self._mapping)
+        pose, covariance = carried(pose, covariance, self.mount)
         if self.localizer is None:
             fix = Correction.none(pose, covariance)
         else:
             fix = self.localizer.correct(found, self.line_map, pose, covariance)
-        readings = np.where(ranges >= sensor.max_range, math.inf, np.where(ranges >= _LEAST_RANGE, ranges, math.nan))
         limits = sensor, self.exploration.tol.gap, self.config.robot.radius
-        scan = Scan(self.angles, filled(readings, *limits), fix.pose, fix.covariance, sensor.full_circle)
-        return Look(scan, found, filled(found.smoothed, *limits), fix)
+        scan = Scan(
+            self.angles, filled(readings(ranges, sensor), *limits), fix.pose, fix.covariance, sensor.full_circle
+        )
+        robot = carried(fix.pose, fix.covariance, self.mount, back=True)
+        return Look(scan, found, filled(found.smoothed, *limits), fix, *robot)
 
     def insert(self, look: Look, target: int | None = None, *, arrived: bool = True) -> None:
         """Take a scan into both maps; `target`: id of the jump edge that the robot set out to measure by it."""
@@ -274,7 +275,7 @@ class Explorer:
             raise InvalidActionError(f"action {action}: no node that can be reached; those are {valid}")
         row, chains = int(self.observed.rows[action]), self.exploration.chains
         self._target = int(chains.id[row])
-        self._heading = self._chosen_heading = float(chains.node[row, 2])
+        self._heading = self._chosen_heading = self._robot_heading(row)
         self.route = self.exploration.path_to(row)
         self._driven, self._stopped = 0.0, False
         return self._leg(self.route)
@@ -318,7 +319,7 @@ class Explorer:
         if not len(row) or not exploration.reachable[row[0]]:
             exploration.attempted(self._target)
             return self._decide("blocked", here, halt)
-        self.route, self._heading = exploration.path_to(int(row[0])), float(exploration.chains.node[row[0], 2])
+        self.route, self._heading = exploration.path_to(int(row[0])), self._robot_heading(int(row[0]))
         return self._leg(self.route)
 
     def stopped(self, why: str, pose: np.ndarray, bearing: float | None = None) -> Leg:
@@ -365,6 +366,10 @@ class Explorer:
         seen = max(contact_along(self.exploration.pieces.segments, route, radius), _CREEP * radius)
         path, whole = _cut_off(route, seen + _HALT * radius)
         return Leg(path, self._heading if whole else None, min(distance, seen), turn, route)
+
+    def _robot_heading(self, row: int) -> float:
+        """How the robot must head at a node for the laser to look at its jump edge, rad."""
+        return float(self.exploration.chains.node[row, 2] - self.mount[2])
 
     @property
     def _last(self) -> Look:

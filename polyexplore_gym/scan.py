@@ -10,6 +10,10 @@ import numpy as np
 from polyexplore_gym.config import SensorConfig
 
 
+_LEAST_RANGE = 1e-6
+"""Smaller readings (m) say nothing, as in `mapping.extract_lines`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """Ranges of one measurement and where the robot believes it stood.
@@ -56,6 +60,11 @@ def on_beams(angles: np.ndarray, ranges: np.ndarray, sensor: SensorConfig) -> np
     return np.where(np.abs(around[nearest] - wanted) <= 0.75 * sensor.resolution, readings[nearest], math.nan)
 
 
+def readings(ranges: np.ndarray, sensor: SensorConfig) -> np.ndarray:
+    """(n,) what drivers give, m, as in a `Scan`: inf from the maximum range on; NaN, unknown, for what is too small."""
+    return np.where(ranges >= sensor.max_range, math.inf, np.where(ranges >= _LEAST_RANGE, ranges, math.nan))
+
+
 def filled(ranges: np.ndarray, sensor: SensorConfig, gap: float, least: float) -> np.ndarray:
     """(n,) ranges with those that are NaN, unknown, replaced by ranges that claim no more than is known.
 
@@ -81,3 +90,19 @@ def filled(ranges: np.ndarray, sensor: SensorConfig, gap: float, least: float) -
             wide = min(near, sensor.max_range) * (after - before) * sensor.resolution
             out[between] = near if wide <= gap else least
     return out
+
+
+def carried(
+    pose: np.ndarray, covariance: np.ndarray, mount: np.ndarray, *, back: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """The laser's pose (3,) and its covariance for those of the robot; `back`: the robot's for those of the laser."""
+    if not mount.any():
+        return pose, covariance
+    heading = pose[2] - mount[2] if back else pose[2]
+    c, s = math.cos(heading), math.sin(heading)
+    off = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1], mount[2]]) * (-1.0 if back else 1.0)
+    # A turn by a small angle e about the one moves the other by e (-off_y, off_x).
+    jacobian = np.array([[1.0, 0.0, -off[1]], [0.0, 1.0, off[0]], [0.0, 0.0, 1.0]])
+    moved = pose + off
+    moved[2] = math.pi - (math.pi - moved[2]) % (2.0 * math.pi)
+    return moved, jacobian @ covariance @ jacobian.T

@@ -17,7 +17,7 @@ from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, Inval
 from polyexplore_gym.exploration import shapes
 from polyexplore_gym.explorer import Explorer, Leg, _cut_off, _rest
 from polyexplore_gym.floorplan import FloorPlan, generate
-from polyexplore_gym.scan import beam_angles, filled, on_beams
+from polyexplore_gym.scan import beam_angles, carried, filled, on_beams
 from polyexplore_gym.sim.pose import PoseModel, with_stops
 from polyexplore_gym.sim.world import DriveResult, World
 
@@ -34,20 +34,30 @@ def config(drive: str, sensing: str, placement: str = "midpoint", pose: str = "e
     return from_mapping(EnvConfig, {"drive": {"mode": drive}, "exploration": exploration, "pose": {"mode": pose}})
 
 
+MOUNT = (0.12, -0.05, 2.0)
+
+
+def on_robot(pose: np.ndarray) -> np.ndarray:
+    """The pose of a laser at `MOUNT`, by complex numbers."""
+    place = complex(*pose[:2]) + complex(*MOUNT[:2]) * np.exp(1j * pose[2])
+    return np.array([place.real, place.imag, pose[2] + MOUNT[2]])
+
+
 class SimulatedRobot:
     """What a robot's own software does: drives legs, takes scans, knows a pose. `tells` more than it has to, or not."""
 
-    def __init__(self, plan: FloorPlan, config: EnvConfig, seed: int, *, tells: bool) -> None:
+    def __init__(self, plan: FloorPlan, config: EnvConfig, seed: int, *, tells: bool, aside: bool = False) -> None:
         _, start_rng, self.laser_rng, pose_rng = gymnasium.utils.seeding.np_random(seed)[0].spawn(4)
         start = plan.sample_start(start_rng, config.robot.radius)
-        self.explorer, self.config, self.tells = Explorer(config), config, tells
+        self.explorer, self.config, self.tells = Explorer(config, MOUNT if aside else (0, 0, 0)), config, tells
+        self.laser_at = on_robot if aside else np.array
         robot = RobotConfig(max_speed=self.explorer.max_speed)
         self.world = World(plan.segments, robot, config.sensor, config.drive, start)
         self.pose = PoseModel(config.pose, start, pose_rng)
         self.track, self.driven = [self.world.pose[None]], 0.0
 
     def look(self, at: np.ndarray) -> Any:
-        ranges = self.world.laser.measure(self.world.segments, at, self.laser_rng)
+        ranges = self.world.laser.measure(self.world.segments, self.laser_at(at), self.laser_rng)
         look = self.explorer.look(ranges, *self.pose.measured(at))
         if self.config.pose.mode == "slam":
             self.pose.correct(look.pose, look.covariance)
@@ -153,19 +163,44 @@ def test_scan_pose_and_halt_are_enough(sensing, placement):
     assert both(generate("home", 6), config("kinematic", sensing, placement), "nearest", tells=False) >= 7
 
 
+@pytest.mark.parametrize("aside", [False, True], ids=["middle", "aside"])
 @pytest.mark.parametrize("pose", ["exact", "gaussian", "slam"])
-def test_a_robot_that_tells_little_sees_all(pose):
+def test_a_robot_that_tells_little_sees_all(pose, aside):
+    """Also one with its laser aside, turned by 115 degrees: it turns so that the laser looks where it should."""
     plan = generate("home", 8)
-    robot = SimulatedRobot(plan, config("physics", "settled", pose=pose), 1, tells=False)
-    robot.begin()
-    nearest = make_policy("nearest")
-    while not robot.explorer.done:
-        assert robot.explorer.plans < 200
-        robot.go(nearest.act(robot.explorer.observation(), robot.explorer.info(), np.random.default_rng(0)))
-    assert robot.explorer.outcome()["status"] == "complete"
-    seen = shapes.exploration_polygon(robot.explorer.exploration)
-    floor = shapely.Polygon(plan.exterior, plan.holes)
-    assert seen.buffer(0.1).intersection(floor).area > 0.97 * floor.area
+    for c in (config("physics", "settled", pose=pose), config("kinematic", "stops", "in_front", pose)):
+        robot = SimulatedRobot(plan, c, 1, tells=False, aside=aside)
+        robot.begin()
+        nearest = make_policy("nearest")
+        while not robot.explorer.done:
+            assert robot.explorer.plans < 200
+            robot.go(nearest.act(robot.explorer.observation(), robot.explorer.info(), np.random.default_rng(0)))
+        assert robot.explorer.outcome()["status"] == "complete"
+        seen = shapes.exploration_polygon(robot.explorer.exploration)
+        floor = shapely.Polygon(plan.exterior, plan.holes)
+        assert seen.buffer(0.1).intersection(floor).area > 0.97 * floor.area
+        assert seen.difference(floor.buffer(0.25)).area < 0.01 * floor.area
+        off = robot.pose.estimate - robot.world.pose
+        assert np.hypot(*off[:2]) < (1e-9 if pose == "exact" else 0.1)
+        assert abs(math.remainder(off[2], math.tau)) < (1e-9 if pose == "exact" else 0.05)
+
+
+def test_the_laser_need_not_be_the_middle_of_the_robot():
+    rng, mount = np.random.default_rng(0), np.array(MOUNT)
+    for _ in range(20):
+        pose, spread = rng.uniform(-3, 3, 3), rng.standard_normal((3, 3)) * 1e-3
+        covariance = spread @ spread.T
+        at, moved = carried(pose, covariance, mount)
+        assert at[:2] == pytest.approx(on_robot(pose)[:2])
+        assert math.cos(at[2] - on_robot(pose)[2]) == pytest.approx(1.0)
+        back, again = carried(at, moved, mount, back=True)
+        assert back[:2] == pytest.approx(pose[:2])
+        assert math.cos(back[2] - pose[2]) == pytest.approx(1.0)
+        assert again == pytest.approx(covariance, abs=1e-15)
+        drawn = np.array([on_robot(pose + spread @ rng.standard_normal(3)) for _ in range(4000)])
+        assert np.cov(drawn.T) == pytest.approx(moved, rel=0.15, abs=0.1 * np.trace(moved))
+    with pytest.raises(InvalidConfigError, match="mount"):
+        Explorer(mount=(0.0, math.nan, 0.0))
 
 
 def test_either_frame_can_be_asked_for():

@@ -20,6 +20,7 @@ from polyexplore_gym.floorplan import generate
 from polyexplore_gym.sim.world import World
 
 NODE = Path(__file__).resolve().parents[2] / "examples" / "10_ros2_node.py"
+MOUNT = (-0.04, 0.0, 0.5 * math.pi)  # of the laser on a TurtleBot 4
 TICK = 0.05  # m driven between two scans
 
 
@@ -62,8 +63,7 @@ class Robot:
     # What the node calls.
 
     def lookup_transform(self, frame: str, other: str, stamp: float) -> Any:
-        assert (frame, other) == ("map", "laser")
-        x, y, heading = self.world.pose
+        x, y, heading = {("map", "base_link"): self.world.pose, ("base_link", "laser"): MOUNT}[frame, other]
         turn = SimpleNamespace(z=math.sin(heading / 2), w=math.cos(heading / 2))
         return SimpleNamespace(transform=SimpleNamespace(translation=SimpleNamespace(x=x, y=y), rotation=turn))
 
@@ -89,7 +89,10 @@ class Robot:
             self.done.finish(SimpleNamespace(status=4 if result.ended == "arrived" else 6))
 
     def scan(self) -> Any:
-        ranges, n = self.world.measure(self.rng), self.config.sensor.beams
+        pose, n = self.world.pose, self.config.sensor.beams
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        pose += (c * MOUNT[0] - s * MOUNT[1], s * MOUNT[0] + c * MOUNT[1], MOUNT[2])
+        ranges = self.world.laser.measure(self.world.segments, pose, self.rng)
         ranges = np.roll(ranges, n // 2).astype(np.float32)  # this driver begins at 0
         header = SimpleNamespace(frame_id="laser", stamp=0.0)
         return SimpleNamespace(
