@@ -34,6 +34,7 @@ from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, Inval
 from polyexplore_gym.exploration import ExplorationMap, Remains
 from polyexplore_gym.mapping import Correction, LineMap, Localizer, ScanLines, extract_lines
 from polyexplore_gym.observation import Observed, observe
+from polyexplore_gym.routes import cut_off, length, rest_of
 from polyexplore_gym.scan import Scan, beam_angles, carried, filled, readings
 
 _SCAN_TURN = 0.5 * math.pi
@@ -119,6 +120,7 @@ class Explorer:
         self._target, self._chosen_heading, self._heading = -1, 0.0, 0.0
         self._driven, self._came = 0.0, [np.zeros((1, 2))]
         self._stopped = False
+        self._way: np.ndarray | None = None
         self._look: Look | None = None
         self._observed: Observed | None = None
 
@@ -165,15 +167,9 @@ class Explorer:
         if self.localizer is not None:
             self.localizer.learn(lines)
         self.exploration.insert(
-            look.scan,
-            lines.segments,
-            lines.alive,
-            touched,
-            point_segment=look.lines.point_segment,
-            ranges=look.smoothed,
-            target=target,
-            arrived=arrived,
-        )
+            look.scan, lines.segments, lines.alive, touched, point_segment=look.lines.point_segment,
+            ranges=look.smoothed, target=target, arrived=arrived,
+        )  # fmt: skip
         self._look, self._observed = look, None
         self.scans += 1
 
@@ -270,7 +266,7 @@ class Explorer:
             InvalidActionError: no such node, or it cannot be reached.
         """
         mask = self.observed.arrays["action_mask"]
-        if not 0 <= action < len(mask) or not mask[action]:
+        if not isinstance(action, (int, np.integer)) or not 0 <= action < len(mask) or not mask[action]:
             valid = np.flatnonzero(mask).tolist()
             raise InvalidActionError(f"action {action}: no node that can be reached; those are {valid}")
         row, chains = int(self.observed.rows[action]), self.exploration.chains
@@ -300,10 +296,10 @@ class Explorer:
             halt: see `plan`.
         """
         exploration, lines, c = self.exploration, self.line_map, self.config.exploration
-        here, route = look.pose[None, :2], self._way
-        rest = _rest(route, here) if rest is None else rest
+        here, route = look.pose[None, :2], self._under_way()
+        rest = rest_of(route, here) if rest is None else rest
         passed = np.concatenate((route[:1], route[1 : len(route) - len(rest) + 1], here))
-        self._driven = self._driven + _length(passed) if driven is None else driven
+        self._driven = self._driven + length(passed) if driven is None else driven
         self._came.append(passed[1:])
         self.insert(look)
         if c.decide == "arrival":
@@ -332,6 +328,7 @@ class Explorer:
             pose: (3,) where the robot is, m and rad.
             bearing: where on its rim it felt an obstacle, rad in its frame; paths will lead around that.
         """
+        self._under_way()
         pose = np.asarray(pose, np.float64)
         if bearing is not None:
             self.exploration.bump(pose, bearing + pose[2])
@@ -341,13 +338,14 @@ class Explorer:
 
     def arrived(self, look: Look, *, came: np.ndarray | None = None, halt: np.ndarray | None = None) -> Leg | None:
         """Take in the scan at the end of a drive; None: it is time to choose again. `came`, `halt`: see `passing`."""
+        way = self._under_way()[: 0 if self._stopped else None]
         self.insert(look, self._target, arrived=not self._stopped)
-        self._came += [self._way[1:], look.pose[None, :2]] if not self._stopped else [look.pose[None, :2]]
+        self._came += [way[1:], look.pose[None, :2]]
         return self._decide(self.ended if self._stopped else "arrived", came, halt)
 
     def _decide(self, ended: str, came: np.ndarray | None, halt: np.ndarray | None) -> Leg | None:
         """End a drive: plan for the next choice. There is no next leg."""
-        self.ended = ended
+        self.ended, self._way = ended, None
         self.plan(np.concatenate(self._came) if came is None else came, halt)
         return None
 
@@ -359,13 +357,19 @@ class Explorer:
         if c.scan_every > 0.0:
             if not sensor.full_circle:
                 turn = min(_SCAN_TURN, 0.5 * sensor.field_of_view)
-            if _length(route) > 1.5 * c.scan_every:  # else the scan at the end will do
+            if length(route) > 1.5 * c.scan_every:  # else the scan at the end will do
                 distance = c.scan_every
         if c.decide == "arrival":
             return Leg(route, self._heading, distance, turn, route)
         seen = max(contact_along(self.exploration.pieces.segments, route, radius), _CREEP * radius)
-        path, whole = _cut_off(route, seen + _HALT * radius)
+        path, whole = cut_off(route, seen + _HALT * radius)
         return Leg(path, self._heading if whole else None, min(distance, seen), turn, route)
+
+    def _under_way(self) -> np.ndarray:
+        """The route driven at the moment (k, 2)."""
+        if self._way is None:
+            raise InvalidActionError("no drive is under way: choose() comes first")
+        return self._way
 
     def _robot_heading(self, row: int) -> float:
         """How the robot must head at a node for the laser to look at its jump edge, rad."""
@@ -376,29 +380,3 @@ class Explorer:
         if self._look is None:
             raise InvalidScanError("no scan so far: look() and insert() come first")
         return self._look
-
-
-def _length(path: np.ndarray) -> float:
-    """Of a path (k, 2), m."""
-    return float(np.hypot(*np.diff(path, axis=0).T).sum())
-
-
-def _rest(route: np.ndarray, here: np.ndarray) -> np.ndarray:
-    """What is left of a route (k, 2) for a robot near it: its place (1, 2), and the vertices that it has not passed."""
-    legs = np.diff(route, axis=0)
-    if not len(legs):
-        return here
-    square = np.maximum((legs**2).sum(axis=1), 1e-300)
-    along = np.clip(((here - route[:-1]) * legs).sum(axis=1) / square, 0.0, 1.0)
-    off = np.hypot(*(route[:-1] + along[:, None] * legs - here).T)
-    return np.concatenate((here, route[int(off.argmin()) + 1 :]))
-
-
-def _cut_off(path: np.ndarray, way: float) -> tuple[np.ndarray, bool]:
-    """The first so many metres of a path (k, 2), and whether that is all of it."""
-    run = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))))
-    if way >= run[-1]:
-        return path, True
-    k = int(np.searchsorted(run, way))
-    share = (way - run[k - 1]) / (run[k] - run[k - 1])
-    return np.concatenate((path[:k], path[k - 1 : k] + share * (path[k] - path[k - 1]))), False

@@ -9,7 +9,6 @@ import numpy as np
 
 from polyexplore_gym.config import SensorConfig
 
-
 _LEAST_RANGE = 1e-6
 """Smaller readings (m) say nothing, as in `mapping.extract_lines`."""
 

@@ -15,8 +15,9 @@ from polyexplore_gym.config import EnvConfig, RobotConfig, SensorConfig, from_ma
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidScanError
 from polyexplore_gym.exploration import shapes
-from polyexplore_gym.explorer import Explorer, Leg, _cut_off, _rest
+from polyexplore_gym.explorer import Explorer, Leg
 from polyexplore_gym.floorplan import FloorPlan, generate
+from polyexplore_gym.routes import cut_off, length, rest_of
 from polyexplore_gym.scan import beam_angles, carried, filled, on_beams
 from polyexplore_gym.sim.pose import PoseModel, with_stops
 from polyexplore_gym.sim.world import DriveResult, World
@@ -220,21 +221,21 @@ def test_either_frame_can_be_asked_for():
 def test_what_is_left_of_a_route():
     route = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 3.0], [5.0, 3.0]])
     for along, left in (((0.0, 0.0), 3), ((1.2, 0.1), 3), ((2.1, 0.5), 2), ((2.2, 3.1), 1), ((5.0, 3.0), 1)):
-        rest = _rest(route, np.array([along]))
+        rest = rest_of(route, np.array([along]))
         assert np.array_equal(rest[0], along)
         assert np.array_equal(rest[1:], route[len(route) - left :])
-    assert np.array_equal(_rest(route[:1], np.array([[0.3, 0.2]])), [[0.3, 0.2]])
+    assert np.array_equal(rest_of(route[:1], np.array([[0.3, 0.2]])), [[0.3, 0.2]])
 
 
 def test_the_beginning_of_a_path():
     path = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]])
     for way, end in ((1.0, [1.0, 0.0]), (3.0, [3.0, 0.0]), (5.0, [3.0, 2.0])):
-        cut, whole = _cut_off(path, way)
+        cut, whole = cut_off(path, way)
         assert not whole
         assert cut[-1] == pytest.approx(end)
-        assert np.hypot(*np.diff(cut, axis=0).T).sum() == pytest.approx(way)
-    assert _cut_off(path, 7.0)[1]
-    assert _cut_off(path, 8.0)[0] is path
+        assert length(cut) == pytest.approx(way)
+    assert cut_off(path, 7.0)[1]
+    assert cut_off(path, 8.0)[0] is path
 
 
 def room(explorer: Explorer, side: float = 6.0) -> np.ndarray:
@@ -262,7 +263,10 @@ def test_unusable_input_is_named():
         Explorer({"sensor": {"beems": 3}})
     explorer.insert(explorer.look(ranges, pose))
     explorer.plan()
-    for action in (-1, 64, 63):
+    for call in (explorer.passing, explorer.arrived, lambda look: explorer.stopped("bump", pose)):
+        with pytest.raises(InvalidActionError, match="no drive is under way"):
+            call(explorer.look(ranges, pose))
+    for action in (-1, 64, 63, 0.0, None):
         with pytest.raises(InvalidActionError, match=f"action {action}: no node"):
             explorer.choose(action)
 
