@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -220,6 +221,71 @@ class Eval:
     """JSON file with fields of the environment's configuration."""
     plots: bool = True
     """Draw the plots."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Play:
+    """Explore a plan yourself, in a window that shows what the robot knows, against a policy from the same start.
+
+    A click on a node chooses it, and so does its number and enter. The result is kept as a policy's is.
+    """
+
+    plan: tyro.conf.Positional[str]
+    """A plan file, or a plan of a suite: home-test/3."""
+    player: str = "person"
+    """Your name: the results are kept under it."""
+    against: str = "nearest"
+    """Name of a baseline, or module:attribute for an own policy."""
+    seed: int = 0
+    """Seed of the start and the noise."""
+    placement: Placement = "in_front"
+    """Where nodes are placed."""
+    sensing: Sensing = "moving"
+    """When the robot measures and decides (see bench)."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    out: Path = Path("results/play")
+    """Folder of the games: each gets a folder of its own, by plan, seed and player."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """Record episodes of a policy as a Minari data set, for offline learning."""
+
+    suite: tuple[str, ...] = ("home-train",)
+    """Suites of generated plans."""
+    plans: tuple[Path, ...] = ()
+    """Plan files, or folders of them, instead of suites."""
+    first: int | None = None
+    """Only the first so many plans, of each suite."""
+    policy: str = "nearest"
+    """Name of a baseline, or module:attribute for an own policy."""
+    seeds: int = 1
+    """Starts (and streams of noise) on each plan."""
+    observation: Literal["dict", "scaled", "flat", "graph", "grid"] = "dict"
+    """What is kept of what was seen: the environment's own arrays, or those of a wrapper."""
+    name: str = "polyexplore/nearest-v0"
+    """Name of the data set."""
+    out: Path = Path("results/datasets")
+    """Folder of data sets, which Minari finds by the variable MINARI_DATASETS_PATH."""
+    workers: int = 0
+    """Processes; 0: one a core."""
+    placement: Placement | None = None
+    """Where nodes are placed, instead of what the configuration says."""
+    sensing: Sensing | None = None
+    """When the robot measures and decides (see bench), instead of what the configuration says."""
+    drive: Drive | None = None
+    """How the robot drives, instead of what the configuration says."""
+    preset: PresetName | None = None
+    """Robot and sensor by name; fields of --config go before those of the preset."""
+    config: Path | None = None
+    """JSON file with fields of the environment's configuration."""
+    reading: tyro.conf.OmitArgPrefixes[PlanFileConfig] = field(default_factory=PlanFileConfig)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -532,6 +598,72 @@ def _posed(
     return corrected_log(log, found), found.track
 
 
+def play(options: Play) -> int:
+    """Let a person explore a plan."""
+    from polyexplore_gym.evaluation.play import Board, Person
+    from polyexplore_gym.evaluation.play import play as game
+
+    if options.seed < 0:
+        raise InvalidConfigError(f"--seed {options.seed}: must not be negative")
+    if not options.player or options.player == options.against:
+        raise InvalidConfigError(f"--player {options.player!r}: must be a name of your own")
+    config = _config(options.config, options.preset, options.drive, options.placement, options.sensing)
+    plan = _plan(options.plan, config.robot.radius, None, options.reading)
+    plan.check_connected(config.robot.radius)
+    boards: list[Board] = []
+
+    def ask(scene: Snapshot) -> int:
+        boards[:] = boards or [Board()]  # no window for a game that was played already
+        return boards[0].ask(scene)
+
+    person = Person(ask, options.player)
+    folder = options.out / re.sub(r"[^\w.-]+", "-", f"{plan.name}-{options.seed}-{options.player}")
+    own, other = game(plan, config, folder, person, seed=options.seed, reference=options.against)
+    if not person.asked:
+        print(f"played before: {folder}; give another --player or --out to play again")
+    print(_run_text(own, plan), _run_text(other, plan), sep="\n")
+    if own.ended and other.ended and other.distance > 0.0:
+        print(f"{own.policy} / {other.policy}: {own.distance / other.distance:.2f} of the distance; kept in {folder}")
+    return 0 if own.status != "failed" else 1
+
+
+def record(options: Record) -> int:
+    """Record a data set."""
+    from tqdm import tqdm
+
+    from polyexplore_gym.evaluation.recording import Recording
+    from polyexplore_gym.evaluation.recording import record as write
+    from polyexplore_gym.optional import require
+
+    minari = require("minari", "datasets")
+    if options.seeds < 1:
+        raise InvalidConfigError(f"--seeds {options.seeds}: must be at least 1")
+    config = _config(options.config, options.preset, options.drive, options.placement, options.sensing)
+    if options.observation != "dict":
+        config = replace(config, observation=replace(config.observation, relative=True))
+    suites = () if options.plans else options.suite
+    recording = Recording(
+        policy=options.policy,
+        plans=list(_bench_plans(replace(options, suite=suites), config)),
+        seeds=range(options.seeds),
+        config=config,
+        observation=options.observation,
+    )
+    place = write(
+        recording,
+        options.out,
+        options.name,
+        workers=options.workers or os.cpu_count() or 1,
+        track=lambda episodes, total: tqdm(episodes, total=total, unit="episode", dynamic_ncols=True),
+    )
+    made = minari.MinariDataset(place)
+    size = sum(path.stat().st_size for path in place.iterdir()) / 1e6
+    print(
+        f"{options.name}: {made.total_episodes} episodes, {made.total_steps} decisions, {size:.1f} MB\nwritten: {place}"
+    )
+    return 0
+
+
 _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "bench": (Bench, bench),
     "run": (Run, run),
@@ -540,6 +672,8 @@ _COMMANDS: dict[str, tuple[type, Callable[[Any], int]]] = {
     "report": (Report, report),
     "plan": (Plan, plan),
     "linemap": (Linemap, linemap),
+    "record": (Record, record),
+    "play": (Play, play),
 }
 
 
@@ -611,7 +745,7 @@ def _suite(name: str) -> Any:
         raise InvalidConfigError(str(error)) from error
 
 
-def _bench_plans(options: Bench, config: EnvConfig) -> Iterator[FloorPlan]:
+def _bench_plans(options: Bench | Record, config: EnvConfig) -> Iterator[FloorPlan]:
     """The plans to run on. A bad file is named and left out; raises when no plan is left."""
     if options.suite and options.plans:
         raise InvalidConfigError("give either --suite or --plans")

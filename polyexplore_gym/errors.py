@@ -21,6 +21,10 @@ class InvalidActionError(PolyExploreError, ValueError):
     """An action is not an integer or lies outside the action space."""
 
 
+class InvalidScanError(PolyExploreError, ValueError):
+    """A scan, its pose or its covariance is unusable; the message says which and why."""
+
+
 class InvalidMotionError(PolyExploreError, ValueError):
     """A pose, path or wall array handed to the simulated world is unusable; the message says which and why."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import re
@@ -122,9 +123,13 @@ def test_commands_run_in_order(reader, capsys):
         words = arguments(command)
         if words[0] == "bench" and not {"--suite", "--plans"} & set(words):
             continue
-        if "intel" in command:  # a log that is not part of the repository: tests/mapping and tests/outline have their own
+        if (
+            "intel" in command
+        ):  # a log that is not part of the repository: tests/mapping and tests/outline have their own
             continue
-        if words[0] in ("train", "eval"):  # hours and minutes: tests/learned runs them
+        if words[0] in ("train", "eval", "play"):  # hours, minutes, a person: tests/learned, tests/evaluation run them
+            continue
+        if words[0] == "record" and not (importlib.util.find_spec("minari") and importlib.util.find_spec("h5py")):
             continue
         extra = ["--workers", "1", "--no-plots", "--drive", "kinematic"] if words[0] == "bench" else []
         if "--gif" in words:  # as long as the exploration
@@ -133,7 +138,8 @@ def test_commands_run_in_order(reader, capsys):
             words[words.index("--first") + 1] = "1"
         capsys.readouterr()
         assert cli.main([*words, *extra]) == 0, command
-        told = {"run": "distance", "bench": "IQM", "linemap": "compression", "report": "written", "plan": "written"}
+        told = {"run": "distance", "bench": "IQM", "linemap": "compression", "report": "written", "plan": "written",
+                "record": "episodes"}  # fmt: skip
         assert told[words[0]] in capsys.readouterr().out
         for option in ("--png", "--gif", "--out"):
             if option in words:

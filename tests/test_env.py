@@ -882,14 +882,14 @@ def test_slam_keeps_one_covariance_of_pose_and_walls():
             break
         action = reachable[observation["node_path_length"][reachable].argmin()]
         observation, _, _, _, info = env.step(int(action))
-        walls = np.flatnonzero(env._lines.tables[1].alive[: env._lines.rho.size])
+        walls = np.flatnonzero(env.line_map.tables[1].alive[: env.line_map.rho.size])
         at = np.stack((2 * walls, 2 * walls + 1), axis=1).ravel()
-        shared = env._localizer._shared[:, at]
-        own = env._localizer._lines[np.ix_(at, at)]
-        joint = np.block([[env._localizer._covariance, shared], [shared.T, own]])
+        shared = env.explorer.localizer._shared[:, at]
+        own = env.explorer.localizer._lines[np.ix_(at, at)]
+        joint = np.block([[env.explorer.localizer._covariance, shared], [shared.T, own]])
         scale = 1.0 / np.sqrt(np.diag(joint))
         assert np.linalg.eigvalsh(joint * np.outer(scale, scale)).min() > -1e-6
-    assert env._localizer._covariance[0, 0] > 0.0
+    assert env.explorer.localizer._covariance[0, 0] > 0.0
 
 
 def test_slam_sees_what_an_exact_pose_sees_and_odometry_does_not():

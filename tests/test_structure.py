@@ -24,21 +24,25 @@ ALLOWED = {
     "errors": set(),
     "presets": set(),
     "config": {"presets"},
-    "scan": set(),
+    "disc": set(),
+    "routes": set(),
+    "scan": {"config"},
     "snapshot": set(),
     "rewards": {"config"},
     "optional": set(),
     "robot_map": set(),
     "floorplan": {"config", "optional", "robot_map"},
-    "sim": {"config"},
+    "sim": {"config", "disc", "scan"},
     "mapping": {"config", "robot_map"},
     "exploration": {"config", "scan"},
     "observation": {"config", "exploration", "mapping"},
     "outline": {"config", "floorplan", "mapping"},
+    "explorer": {"config", "disc", "exploration", "mapping", "observation", "routes", "scan"},
+    "wrappers": {"config"},
     "animation": {"optional", "snapshot"},
     "rendering": {"animation", "optional", "snapshot"},
     "env": {
-        "config", "exploration", "floorplan", "mapping", "observation", "outline", "rendering", "rewards", "scan",
+        "config", "exploration", "explorer", "floorplan", "mapping", "observation", "outline", "rendering", "rewards",
         "sim", "snapshot",
     },
 }  # fmt: skip
@@ -53,6 +57,8 @@ HEAVY = {
     "PIL",
     "ray",
     "jinja2",
+    "minari",
+    "h5py",
     "ezdxf",
 }
 SCRIPTED = (
@@ -186,14 +192,36 @@ def test_the_maps_have_no_way_to_the_truth():
     graph: dict[str, set[str]] = {name: set() for name in MODULES}
     for name, imported, _ in project_imports():
         graph[name].add(imported)
-    for start in ("mapping", "exploration"):
+    own = {"explorer": {"disc", "exploration", "mapping", "observation", "routes"}}
+    for start in ("mapping", "exploration", "explorer"):
         todo = [name for name in MODULES if part(name) == start]
         seen = set(todo)
         while todo:
             found = graph[todo.pop()] - seen
             seen |= found
             todo += found
-        assert {part(name) for name in seen} <= {start, "config", "errors", "presets", "robot_map", "scan"}
+        allowed = {start, "config", "errors", "presets", "robot_map", "scan"} | own.get(start, set())
+        assert {part(name) for name in seen} <= allowed
+
+
+def test_wrappers_see_what_the_robot_knows_alone():
+    """Of the environment below them they touch its configuration, its explorer and its masks."""
+    touched = {
+        node.attr
+        for name, tree in TREES.items()
+        if part(name) == "wrappers"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("env.unwrapped", "self.env.unwrapped")
+    }
+    assert touched == {"config", "explorer"}
+    asked = [
+        ast.unparse(node.args[0])
+        for name, tree in TREES.items()
+        if part(name) == "wrappers"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("get_wrapper_attr")
+    ]
+    assert asked == ["'action_masks'"]
 
 
 def test_scripted_policies_act_on_the_observation_alone():
@@ -242,6 +270,8 @@ def loaded_by(statement: str) -> set[str]:
     [
         ("import polyexplore_gym", {*HEAVY, "numba", "shapely", "pymunk", "scipy", "joblib", "tyro"}),
         ("import polyexplore_gym.env", HEAVY),
+        ("import polyexplore_gym.explorer", {*HEAVY, "pymunk"}),
+        ("import polyexplore_gym.wrappers", {*HEAVY, "numba", "pymunk", "shapely"}),
         ("import polyexplore_gym.cli", HEAVY),
         ("import polyexplore_gym.evaluation, baselines", {*HEAVY, "numba"}),
         ("import polyexplore_gym.rendering", HEAVY),

@@ -1,7 +1,7 @@
-"""From what scans saw, and the lines of the map, to a floor plan: `views_of`, `trace`, `floor_plan`."""
+"""From what scans saw, and the lines of the map, to a floor plan: `views_of`, `trace`, `floor_plan`; `explored` is all of it."""
 
-from polyexplore_gym.outline.plan import floor_plan
+from polyexplore_gym.outline.plan import explored, floor_plan
 from polyexplore_gym.outline.tracing import Outline, trace
 from polyexplore_gym.outline.views import Views, views_of
 
-__all__ = ["Outline", "Views", "floor_plan", "trace", "views_of"]
+__all__ = ["Outline", "Views", "explored", "floor_plan", "trace", "views_of"]

@@ -16,6 +16,7 @@ from numba import njit
 
 from polyexplore_gym.config import SensorConfig
 from polyexplore_gym.errors import InvalidMotionError
+from polyexplore_gym.scan import beam_angles
 
 ON_LINE = 1e-9
 """Closer than this (m) to a wall's line the wall is seen edge-on, and to the wall itself the sensor stands on it.
@@ -208,8 +209,7 @@ class Laser:
 
     def __init__(self, config: SensorConfig) -> None:
         self.config = config
-        n, fov = config.beams, config.field_of_view
-        angles = -math.pi + np.arange(n) * (_TWO_PI / n) if config.full_circle else np.linspace(-fov / 2, fov / 2, n)
+        angles = beam_angles(config)
         angles.flags.writeable = False
         self._angles = angles
         self._cos, self._sin = np.cos(angles), np.sin(angles)

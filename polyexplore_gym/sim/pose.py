@@ -189,3 +189,21 @@ def _checked_pose(pose: np.ndarray) -> np.ndarray:
         raise InvalidMotionError(f"pose {pose!r}: expected three finite numbers")
     out[2] = wrap(out[2])
     return out
+
+
+def with_stops(way: np.ndarray, every: float) -> tuple[np.ndarray, list[int]]:
+    """A trajectory (m, 3) with a pose at every so many metres put in, and the rows of those; none near the end.
+
+    A radian turned counts as a metre.
+    """
+    run = np.hypot(*np.diff(way[:, :2], axis=0).T)
+    run += np.abs(np.remainder(np.diff(way[:, 2]) + math.pi, 2.0 * math.pi) - math.pi)
+    driven = np.concatenate(([0.0], np.cumsum(run)))
+    marks = np.arange(every, driven[-1] - 0.5 * every, every)
+    if not len(marks):
+        return way, []
+    nxt = np.searchsorted(driven, marks)
+    share = ((marks - driven[nxt - 1]) / (driven[nxt] - driven[nxt - 1]))[:, None]
+    step = way[nxt] - way[nxt - 1]
+    step[:, 2] = np.remainder(step[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+    return np.insert(way, nxt, way[nxt - 1] + share * step, axis=0), (nxt + np.arange(len(marks))).tolist()

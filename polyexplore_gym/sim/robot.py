@@ -12,10 +12,10 @@ import math
 import numpy as np
 from numba import njit
 
+from polyexplore_gym.disc import enters, first_contact
+
 STANDOFF = 0.004
 """How far from a wall a kinematic robot stops that would bump into it, in radii (1 mm at a radius of 0.25 m)."""
-_GRAZE = 4e-9
-"""A disc that dips less than this, in radii, into a wall does not touch it when it glides along a path."""
 SKIN = 1e-7
 """A disc that slides keeps this far from walls, in radii, so that no rounding lets it overlap; nearer than twice as
 far it touches."""
@@ -105,89 +105,6 @@ def wrap_headings(trajectory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _enters(ax, ay, bx, by, dx, dy, radius):  # type: ignore[no-untyped-def]
-    """First t in [0, 1] at which the point t (dx, dy) comes within radius of the segment a, b; inf if never.
-
-    At t = 0 it counts only if the point moves closer.
-    """
-    ex, ey = bx - ax, by - ay
-    length2 = ex * ex + ey * ey
-    u = 0.0
-    if length2 > 0.0:
-        u = min(1.0, max(0.0, -(ax * ex + ay * ey) / length2))
-    qx, qy = ax + u * ex, ay + u * ey
-    if qx * qx + qy * qy <= radius * radius:
-        return 0.0 if qx * dx + qy * dy > 0.0 else np.inf
-    first = np.inf
-    if length2 > 0.0:  # the straight sides
-        length = math.sqrt(length2)
-        nx, ny = -ey / length, ex / length
-        height, rate = -(ax * nx + ay * ny), dx * nx + dy * ny  # signed height of the point over the line
-        if height < 0.0:
-            height, rate = -height, -rate
-        if rate < 0.0:
-            t = max(height - radius, 0.0) / -rate  # beside the wall it is higher, but for rounding
-            along = ((t * dx - ax) * ex + (t * dy - ay) * ey) / length2
-            if t <= 1.0 and 0.0 <= along <= 1.0:
-                return t
-    square = dx * dx + dy * dy
-    for end in range(2):  # the round ends
-        cx, cy = (ax, ay) if end == 0 else (bx, by)
-        half = cx * dx + cy * dy
-        gap = max(cx * cx + cy * cy - radius * radius, 0.0)
-        root = half * half - square * gap
-        if half > 0.0 and root >= 0.0:
-            t = gap / (half + math.sqrt(root))
-            if t <= 1.0:
-                first = min(first, t)
-    return first
-
-
-@njit(cache=True)
-def first_contact(segments, x, y, dx, dy, radius, standoff):  # type: ignore[no-untyped-def]
-    """How far a disc at (x, y) gets along (dx, dy) before it touches a wall.
-
-    standoff m. Returns (contact, stop): the share of the motion at which it touches, inf if it never does, and the
-    share at which its rim is still `standoff` from that wall (0 if it starts closer). A disc that touches a wall
-    already is only held by it if it moves into it.
-    """
-    contact, stop = np.inf, np.inf
-    graze = _GRAZE * radius
-    reach = radius + standoff
-    x_min, x_max = x + min(0.0, dx) - reach, x + max(0.0, dx) + reach
-    y_min, y_max = y + min(0.0, dy) - reach, y + max(0.0, dy) + reach
-    if dx == 0.0 and dy == 0.0:
-        return contact, stop
-    for k in range(segments.shape[0]):
-        x1, y1, x2, y2 = segments[k]
-        if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
-            continue
-        t = _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, radius - graze)
-        if t < contact:
-            contact = t
-            stop = min(t, _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
-    return contact, stop
-
-
-@njit(cache=True)
-def contact_along(segments, path, radius):  # type: ignore[no-untyped-def]
-    """Way (m) along a path (k, 2) after which a disc touches a segment (m, 4); inf if it touches none.
-
-    One that it touches at the start counts only if it moves into it.
-    """
-    way = 0.0
-    for k in range(path.shape[0] - 1):
-        x, y = path[k]
-        dx, dy = path[k + 1, 0] - x, path[k + 1, 1] - y
-        length = math.hypot(dx, dy)
-        contact, _ = first_contact(segments, x, y, dx, dy, radius, 0.0)
-        if contact <= 1.0:
-            return way + contact * length
-        way += length
-    return np.inf
-
-
-@njit(cache=True)
 def _touching(segments, x, y, radius):  # type: ignore[no-untyped-def]
     """Walls that a disc touches: index, normal (towards the disc) and place of the contact along the wall (0 to 1)."""
     out = np.empty((segments.shape[0], 4))
@@ -264,7 +181,7 @@ def _sweep(segments, touched, x, y, dx, dy, radius):  # type: ignore[no-untyped-
         x1, y1, x2, y2 = segments[k]
         if max(x1, x2) < x_min or min(x1, x2) > x_max or max(y1, y2) < y_min or min(y1, y2) > y_max:
             continue
-        free = min(free, _enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
+        free = min(free, enters(x1 - x, y1 - y, x2 - x, y2 - y, dx, dy, reach))
     return free
 
 

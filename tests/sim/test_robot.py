@@ -6,6 +6,7 @@ import shapely
 import shapely.ops
 from sim_scenes import clear_point, lines_of, random_walls
 
+from polyexplore_gym.disc import contact_along, first_contact
 from polyexplore_gym.sim.robot import (
     ARRIVED,
     CUT,
@@ -14,8 +15,6 @@ from polyexplore_gym.sim.robot import (
     advance,
     apart,
     bounded,
-    contact_along,
-    first_contact,
     glide,
     is_free,
     nearest_wall,
