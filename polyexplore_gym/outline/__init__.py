@@ -1,4 +1,4 @@
-"""From what scans saw, and the lines of the map, to a floor plan: `views_of`, `trace`, `floor_plan`; `explored` is all of it."""
+"""From what scans saw, and the lines of the map, to a floor plan: `explored`, or `views_of`, `trace`, `floor_plan`."""
 
 from polyexplore_gym.outline.plan import explored, floor_plan
 from polyexplore_gym.outline.tracing import Outline, trace
