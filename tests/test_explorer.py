@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -11,12 +13,14 @@ import pytest
 import shapely
 
 from baselines import make_policy
+from polyexplore_gym import observation
 from polyexplore_gym.config import EnvConfig, RobotConfig, SensorConfig, from_mapping
 from polyexplore_gym.env import PolyExploreEnv
 from polyexplore_gym.errors import InvalidActionError, InvalidConfigError, InvalidScanError
 from polyexplore_gym.exploration import shapes
 from polyexplore_gym.explorer import Explorer, Leg
 from polyexplore_gym.floorplan import FloorPlan, generate
+from polyexplore_gym.mapping import read_log
 from polyexplore_gym.routes import cut_off, length, rest_of
 from polyexplore_gym.scan import beam_angles, carried, filled, on_beams
 from polyexplore_gym.sim.pose import PoseModel, with_stops
@@ -342,3 +346,41 @@ def test_beams_of_another_scanner():
                 assert off[ranges == reading].min() == pytest.approx(off.min(), abs=1e-9)
     ranges = rng.uniform(1, 5, 90)
     assert np.array_equal(on_beams(wanted, ranges, sensor), ranges)
+
+
+DATA = Path(os.environ.get("POLYEXPLORE_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+LOG = DATA / "laser_logs" / "intel-corrected.log.gz"
+
+
+@pytest.mark.skipif(not LOG.exists(), reason="needs the real laser logs")
+def test_a_real_log_gives_nodes_and_ways_that_keep_clear_of_its_walls():
+    log = read_log(LOG)
+    angles = log.angles[0]
+    sensor = {"beams": len(angles), "field_of_view": float(np.ptp(angles)), "max_range": 8.0, "sigma_range": 0.02}
+    explorer = Explorer({"sensor": sensor, "mapping": {"range_floor": 0.01}, "pose": {"mode": "gaussian"}})
+    covariance, last = np.diag([0.03, 0.03, 0.006]) ** 2, None
+    nearest, space = make_policy("nearest"), observation.space(explorer.config.observation)
+    for at, ranges in zip(log.poses, log.ranges, strict=True):
+        if (
+            last is not None
+            and math.dist(at[:2], last[:2]) < 0.5
+            and abs(math.remainder(at[2] - last[2], 6.2832)) < 0.5
+        ):
+            continue
+        last = at
+        explorer.insert(explorer.look(on_beams(angles - angles.mean(), ranges, explorer.config.sensor), at, covariance))
+        explorer.plan()
+        seen = explorer.observation()
+        assert space.contains(seen)
+        if explorer.done:
+            continue
+        leg = explorer.choose(nearest.act(seen, explorer.info(), np.random.default_rng(0)))
+        assert leg.path[0] == pytest.approx(at[:2])
+        way = shapely.LineString(leg.path[1:]) if len(leg.path) > 2 else shapely.Point(leg.path[-1])
+        walls = shapely.MultiLineString(list(explorer.line_map.segments[explorer.line_map.alive].reshape(-1, 2, 2)))
+        # (From the first point it first has to get away from walls that it stands too near to.)
+        assert way.distance(walls) > 0.8 * explorer.config.robot.radius
+        if explorer.scans == 40:
+            break
+    assert explorer.line_map.line_alive.sum() > 30
+    assert explorer.action_masks().sum() > 5
