@@ -165,10 +165,10 @@ def test_a_configuration_file(folder, tmp_path, capsys):
 
 
 def test_what_is_left_is_told(folder, capsys, monkeypatch):
-    from polyexplore_gym.env import PolyExploreEnv
+    from polyexplore_gym.explorer import Explorer
 
     left = {"status": "unreached", "unreached": 3, "unreached_length": 2.5, "given_up": 1, "given_up_length": 0.75}
-    monkeypatch.setattr(PolyExploreEnv, "_outcome", lambda self, truncated: left)
+    monkeypatch.setattr(Explorer, "outcome", lambda self, budget=False: left)
     assert main(["run", str(folder / "rooms.json"), "--drive", "kinematic"]) == 0
     told = capsys.readouterr().out.splitlines()[0]
     assert told.endswith("kinematic: unreached, 3 jump edges (2.5 m) out of reach, 1 jump edges (0.8 m) given up")
