@@ -4,6 +4,7 @@ python examples/11_record_and_clone.py [--episodes 200]      (extras "datasets" 
 """
 
 import argparse
+import tempfile
 
 import gymnasium as gym
 import minari
@@ -40,10 +41,12 @@ if __name__ == "__main__":
     plans = [suite("home-train").plan(i) for i in range(parser.parse_args().episodes)]
     config = from_mapping(EnvConfig, CONFIG)
     teacher = Recording(policy="modified_sum", plans=plans, config=config, observation="flat")
-    data = minari.MinariDataset(record(teacher, "datasets", "polyexplore/modified-sum-v0"))
+    with tempfile.TemporaryDirectory() as folder:
+        data = minari.MinariDataset(record(teacher, folder, "polyexplore/modified-sum-v0"))
+        episodes = list(data)
 
-    seen = torch.tensor(np.concatenate([e.observations[:-1] for e in data])).reshape(-1, 32, len(FEATURES))
-    chosen = torch.tensor(np.concatenate([e.actions for e in data]))
+    seen = torch.tensor(np.concatenate([e.observations[:-1] for e in episodes])).reshape(-1, 32, len(FEATURES))
+    chosen = torch.tensor(np.concatenate([e.actions for e in episodes]))
     torch.manual_seed(0)
     score = torch.nn.Sequential(torch.nn.Linear(len(FEATURES), 64), torch.nn.ReLU(), torch.nn.Linear(64, 1))
     optimizer = torch.optim.Adam(score.parameters(), 3e-3)

@@ -506,6 +506,8 @@ def linemap(options: Linemap) -> int:
         raise InvalidConfigError(f"{options.trajectory}: the folder {options.trajectory.parent} does not exist")
     files = _map_files(options)
     _check_plan_files(options.plan)
+    if both := {path.resolve() for path in files} & {path.resolve() for path in options.plan}:
+        raise InvalidConfigError(f"{min(both)}: named by --out and by --plan")
     fov = options.field_of_view
     if fov is not None and not 0 < fov <= 360:
         raise InvalidConfigError(f"--field-of-view {fov}: must lie in (0, 360]")
@@ -595,7 +597,7 @@ def _posed(
     except KeyboardInterrupt:
         _say(f"\nstopped; what is matched is in {state}: the same command goes on from there")
         raise
-    return corrected_log(log, found), found.track
+    return corrected_log(log, found), None if options.trajectory is None else found.track
 
 
 def play(options: Play) -> int:
@@ -883,6 +885,8 @@ def _map_files(options: Linemap) -> list[Path]:
 
     if not 100 <= options.width <= 20_000:
         raise InvalidConfigError(f"--width {options.width}: must lie in 100 to 20000")
+    if not options.out:
+        raise InvalidConfigError("--out: name a file or a folder")
     files = []
     for path in options.out:
         if path.is_dir() or not path.suffix:

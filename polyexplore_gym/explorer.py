@@ -44,6 +44,12 @@ _CREEP, _HALT = 0.4, 0.1
 radii at a time; it can halt so many radii behind that place. Tuned: few bumps for little time."""
 
 
+def _is_covariance(matrix: np.ndarray) -> bool:
+    """Whether a matrix (3, 3) is symmetric and positive semidefinite, but for rounding."""
+    small = 1e-9 * np.abs(matrix).max()
+    return bool(np.abs(matrix - matrix.T).max() <= small and np.linalg.eigvalsh(matrix)[0] >= -small)
+
+
 class Leg(NamedTuple):
     """What to drive until the next scan."""
 
@@ -134,11 +140,14 @@ class Explorer:
             ranges: (n,) m, of the beams `angles`; inf, or the maximum range and more: nothing met; NaN, zero and
                 negative: unknown. (`polyexplore_gym.scan.on_beams` takes over readings of other beams.)
             pose: (3,) x, y (m) and heading (rad) of the robot in the map frame when it was taken.
-            covariance: (3, 3) of the pose, m2, m rad, rad2; None: exact.
+            covariance: (3, 3) of the pose, m2, m rad, rad2; None: exact (not with "slam").
 
         Raises:
-            InvalidScanError: an array has another shape, or the pose or its covariance is not finite.
+            InvalidScanError: an array has another shape, the pose or its covariance is not finite or none at all, the
+                covariance is missing in the mode "slam", or no beam says anything.
         """
+        if covariance is None and self.localizer is not None:
+            raise InvalidScanError('pose.mode "slam" needs the covariance of the pose: by how much it may be corrected')
         ranges, pose = np.asarray(ranges), np.array(pose, np.float64)
         covariance = np.zeros((3, 3)) if covariance is None else np.array(covariance, np.float64)
         sensor = self.config.sensor
@@ -147,6 +156,10 @@ class Explorer:
         for name, array, shape in (("pose", pose, (3,)), ("covariance", covariance, (3, 3))):
             if array.shape != shape or not np.isfinite(array).all():
                 raise InvalidScanError(f"{name} {array.tolist()}: expected finite numbers of shape {shape}")
+        if covariance.any() and not _is_covariance(covariance):
+            raise InvalidScanError(f"covariance {covariance.tolist()}: must be symmetric and positive semidefinite")
+        if not (ranges > 0.0).any():
+            raise InvalidScanError("no beam says anything, neither wall nor free: is the laser on?")
         found = extract_lines(self.angles, ranges, sensor, self._mapping)
         pose, covariance = carried(pose, covariance, self.mount)
         if self.localizer is None:
@@ -207,7 +220,12 @@ class Explorer:
 
     @property
     def done(self) -> bool:
-        """Whether no node can be reached: the exploration is over."""
+        """Whether no node can be reached: the exploration is over.
+
+        Raises:
+            InvalidScanError: no scan was taken in so far.
+        """
+        _ = self._last
         return not self.exploration.reachable.any()
 
     @property
@@ -278,7 +296,12 @@ class Explorer:
             InvalidActionError: no such node, or it cannot be reached.
         """
         mask = self.observed.arrays["action_mask"]
-        if not isinstance(action, (int, np.integer)) or not 0 <= action < len(mask) or not mask[action]:
+        if (
+            isinstance(action, bool)
+            or not isinstance(action, (int, np.integer))
+            or not 0 <= action < len(mask)
+            or not mask[action]
+        ):
             valid = np.flatnonzero(mask).tolist()
             raise InvalidActionError(f"action {action}: no node that can be reached; those are {valid}")
         row, chains = int(self.observed.rows[action]), self.exploration.chains
@@ -342,6 +365,8 @@ class Explorer:
         """
         self._under_way()
         pose = np.asarray(pose, np.float64)
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise InvalidScanError(f"pose {pose.tolist()}: expected finite numbers of shape (3,)")
         if bearing is not None:
             self.exploration.bump(pose, bearing + pose[2])
         self.ended, self._stopped = why, True

@@ -459,6 +459,22 @@ def test_a_stopped_correction_goes_on(raw_log, tmp_path, capsys, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
+def test_poses_of_a_log_without_times(tmp_path, capsys):
+    """They are found; times are of use to --trajectory alone."""
+    angles = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+    ranges = np.tile(2.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles))), (3, 1))
+    np.savez(tmp_path / "still.npz", angles=angles, ranges=ranges, odometry=np.zeros((3, 3)))
+    for source in ("odometry", "none"):
+        out = tmp_path / f"{source}.json"
+        assert main(["linemap", str(tmp_path / "still.npz"), "--poses", source, "--out", str(out)]) == 0
+        assert len(json.loads(out.read_text())["lines"]) == 4
+    out = str(tmp_path / "a.json")
+    assert main(["linemap", str(tmp_path / "still.npz"), "--out", out, "--plan", out]) == 2
+    assert "named by --out and by --plan" in capsys.readouterr().err
+    assert main(["linemap", str(tmp_path / "still.npz"), "--out"]) == 2
+    assert "--out: name a file or a folder" in capsys.readouterr().err
+
+
 def test_poses_that_cannot_be_had_are_told(raw_log, tmp_path, capsys):
     log, _ = raw_log
     nowhere = str(tmp_path / "nowhere" / "t.txt")

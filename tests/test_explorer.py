@@ -253,6 +253,10 @@ def test_unusable_input_is_named():
     ranges, pose = room(explorer), np.zeros(3)
     with pytest.raises(InvalidScanError, match="no scan so far"):
         explorer.plan()
+    with pytest.raises(InvalidScanError, match="no scan so far"):
+        assert explorer.done  # nothing known is not all known
+    with pytest.raises(InvalidScanError, match="needs the covariance"):
+        Explorer({"sensor": {"beams": 181}, "pose": {"mode": "slam"}}).look(ranges, pose)
     for bad, at, covariance, match in (
         (ranges[1:], pose, None, "expected 181 numbers"),
         (ranges.astype(str), pose, None, "expected 181 numbers"),
@@ -260,6 +264,9 @@ def test_unusable_input_is_named():
         (ranges, [0.0, math.nan, 0.0], None, "pose .*finite"),
         (ranges, pose, np.full((3, 3), math.inf), "covariance .*finite"),
         (ranges, pose, np.zeros(3), "covariance .*shape"),
+        (ranges, pose, -0.01 * np.eye(3), "covariance .*positive semidefinite"),
+        (ranges, pose, 0.01 * np.eye(3, k=1), "covariance .*symmetric"),
+        (np.full(181, math.nan), pose, None, "no beam says anything"),
     ):
         with pytest.raises(InvalidScanError, match=match):
             explorer.look(bad, at, covariance)
@@ -270,7 +277,7 @@ def test_unusable_input_is_named():
     for call in (explorer.passing, explorer.arrived, lambda look: explorer.stopped("bump", pose)):
         with pytest.raises(InvalidActionError, match="no drive is under way"):
             call(explorer.look(ranges, pose))
-    for action in (-1, 64, 63, 0.0, None):
+    for action in (-1, 64, 63, 0.0, None, True):
         with pytest.raises(InvalidActionError, match=f"action {action}: no node"):
             explorer.choose(action)
 

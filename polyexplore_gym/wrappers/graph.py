@@ -28,7 +28,7 @@ class Graph(Relative):
 
     def __init__(self, env: gymnasium.Env, neighbours: int = 6) -> None:
         """Raises `InvalidConfigError` if the observation is not relative, has no paths between nodes, or too few."""
-        super().__init__(env)
+        super().__init__(env, neighbours=neighbours)
         if not self.sizes.pairwise:
             raise InvalidConfigError("Graph needs the paths between nodes: config={'observation': {'pairwise': True}}")
         n = self.sizes.max_nodes

@@ -37,7 +37,7 @@ class GridImage(Relative):
 
         Raises `InvalidConfigError` if the observation is not relative, or a number is out of range.
         """
-        super().__init__(env)
+        super().__init__(env, size=size, resolution=resolution)
         if not 8 <= size <= 1024:
             raise InvalidConfigError(f"size = {size}: must lie in 8 to 1024 pixels")
         if not (math.isfinite(resolution) and resolution > 0.0):

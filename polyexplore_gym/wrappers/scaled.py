@@ -53,13 +53,21 @@ def scaled(arrays: Arrays) -> Arrays:
     return {**{key: value.astype(np.float32) for key, value in out.items()}, **{key: arrays[key] for key in masks}}
 
 
-class Relative(gymnasium.ObservationWrapper):
+class Relative(gymnasium.ObservationWrapper, gymnasium.utils.RecordConstructorArgs):
     """Base of wrappers of an environment that observes from the robot (`observation.relative`)."""
 
-    def __init__(self, env: gymnasium.Env) -> None:
-        """Raises `InvalidConfigError` if the environment's observation is not relative."""
+    def __init__(self, env: gymnasium.Env, **arguments: Any) -> None:
+        """`arguments`: of the wrapper, so that Gymnasium can make it again.
+
+        Raises `InvalidConfigError` if the environment is none of this package, or its observation is not relative.
+        """
+        gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
         super().__init__(env)
-        config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
+        config = getattr(env.unwrapped, "config", None)
+        if not isinstance(config, EnvConfig) or env.observation_space != env.unwrapped.observation_space:
+            raise InvalidConfigError(
+                f"{type(self).__name__} wraps an environment of polyexplore_gym as it is, not {env}"
+            )
         if not config.observation.relative:
             needs = "needs what is seen from the robot: config={'observation': {'relative': True}}"
             raise InvalidConfigError(f"{type(self).__name__} {needs}")

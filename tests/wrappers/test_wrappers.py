@@ -47,6 +47,21 @@ def test_each_is_an_environment(wrapper):
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS.values(), ids=WRAPPERS)
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version.*")
+def test_gymnasium_makes_each_again(wrapper):
+    config = {"observation": SIZES, "drive": {"mode": "kinematic"}}
+    env = wrapper(gymnasium.make("PolyExplore-Home-v2", config=config))
+    check_env(env, skip_render_check=True)
+    again = gymnasium.make(env.spec)
+    assert again.observation_space == env.observation_space
+    assert isinstance(again, wrapper)
+    with pytest.raises(InvalidConfigError, match="as it is"):
+        wrapper(env)
+    with pytest.raises(InvalidConfigError, match="as it is"):
+        wrapper(gymnasium.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS.values(), ids=WRAPPERS)
 def test_masks_stay_and_all_lies_within_the_space(wrapper):
     env = made(wrapper)
     for inside, outer in scenes(env, 30):
