@@ -1,7 +1,6 @@
 """Record a policy as a Minari data set, and clone it: one small network that scores every node alike.
 
-python examples/11_record_and_clone.py [--episodes 200]      (extras "datasets" and "train")
-"""
+python examples/11_record_and_clone.py [--episodes 200]      (extras "datasets" and "train")"""
 
 import argparse
 import tempfile
@@ -36,14 +35,12 @@ def explored(env, score):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--episodes", type=int, default=200)
+    (parser := argparse.ArgumentParser()).add_argument("--episodes", type=int, default=200)
     plans = [suite("home-train").plan(i) for i in range(parser.parse_args().episodes)]
     config = from_mapping(EnvConfig, CONFIG)
     teacher = Recording(policy="modified_sum", plans=plans, config=config, observation="flat")
     with tempfile.TemporaryDirectory() as folder:
-        data = minari.MinariDataset(record(teacher, folder, "polyexplore/modified-sum-v0"))
-        episodes = list(data)
+        episodes = list(minari.MinariDataset(record(teacher, folder, "polyexplore/modified-sum-v0")))
 
     seen = torch.tensor(np.concatenate([e.observations[:-1] for e in episodes])).reshape(-1, 32, len(FEATURES))
     chosen = torch.tensor(np.concatenate([e.actions for e in episodes]))

@@ -63,11 +63,12 @@ class Relative(gymnasium.ObservationWrapper, gymnasium.utils.RecordConstructorAr
         """
         gymnasium.utils.RecordConstructorArgs.__init__(self, **arguments)
         super().__init__(env)
-        config = getattr(env.unwrapped, "config", None)
-        if not isinstance(config, EnvConfig) or env.observation_space != env.unwrapped.observation_space:
+        space = env.observation_space
+        if not isinstance(space, spaces.Dict) or not {"pose", "max_range", "node_position"} <= set(space.spaces):
             raise InvalidConfigError(
                 f"{type(self).__name__} wraps an environment of polyexplore_gym as it is, not {env}"
             )
+        config: EnvConfig = env.unwrapped.config  # type: ignore[attr-defined]
         if not config.observation.relative:
             needs = "needs what is seen from the robot: config={'observation': {'relative': True}}"
             raise InvalidConfigError(f"{type(self).__name__} {needs}")
